@@ -36,7 +36,10 @@ fn main() -> anyhow::Result<()> {
     let learned = TransformerWorld::new(network, SamplingConfig::default());
     for record in gump::data::open(path.as_ref())?.take(3) {
         let scenario = record?.scenario;
-        let (mut rules, mut model) = (NuplanIdm::default(), Imagined::new(&learned, Seed(0)));
+        let (mut rules, mut model) = (
+            NuplanIdm::default(),
+            ImaginedTraffic::new(&learned, Seed(0)),
+        );
         for world in [&mut Replayed as &mut dyn Traffic, &mut rules, &mut model] {
             // ANCHOR: score
             let config = DriveConfig::default();

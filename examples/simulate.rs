@@ -53,9 +53,9 @@ fn main() -> anyhow::Result<()> {
     std::fs::create_dir_all("out")?;
     grid_film(&takes, &spec)?.save(Path::new("out/simulate.gif"))?;
     println!(
-        "{}: {} passes of the transformer, open out/simulate.gif",
+        "{}: {} futures, open out/simulate.gif",
         scenario.id,
-        world.passes()
+        futures.len()
     );
     Ok(())
 }

@@ -48,12 +48,12 @@ class GumpSb3VecEnv(VecEnv):
 
     def step_wait(self):
         """What came of them."""
-        observations, rewards, terminated, truncated, told = self.env.step(self._actions)
+        observations, rewards, terminated, truncated, extras = self.env.step(self._actions)
         infos = [{} for _ in range(self.num_envs)]
         for row in np.flatnonzero(terminated | truncated):
             info = infos[row]
-            info.update({key: told["final_info"][key][row].item() for key in _TOLD})
-            info["terminal_observation"] = told["final_obs"][row]
+            info.update({key: extras["final_info"][key][row].item() for key in _TOLD})
+            info["terminal_observation"] = extras["final_obs"][row]
             info["TimeLimit.truncated"] = bool(truncated[row])
             info["episode"] = {"r": info["return"], "l": info["steps"]}
         return observations, rewards.astype(np.float32), terminated | truncated, infos

@@ -50,7 +50,7 @@ pub(crate) fn legend(world: &str) -> String {
 /// Writes `STEM.svg` and `STEM.png` into the folder of the run; nothing if there is no number.
 pub(crate) fn save(run: &Run, stem: &str, bars: &Bars) -> anyhow::Result<()> {
     match bars.save(&run.path(stem)) {
-        Err(VizError::EmptyChart(_)) => Ok(()),
+        Err(VizError::EmptyChart { .. }) => Ok(()),
         saved => Ok(saved?),
     }
 }

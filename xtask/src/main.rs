@@ -23,6 +23,7 @@ mod imagine;
 mod installed;
 mod losses;
 mod machine;
+mod notes;
 mod peers;
 mod planners;
 mod progress;

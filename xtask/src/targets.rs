@@ -8,7 +8,7 @@ use std::path::Path;
 
 use anyhow::Context as _;
 use gump_metrics::statistics::{
-    Distribution, Measure, MeasuredDistribution, Statistics, class_name, class_of_name,
+    Distribution, MeasuredDistribution, Statistic, Statistics, class_name, class_of_name,
 };
 use serde::{Deserialize, Serialize};
 
@@ -59,13 +59,20 @@ pub(crate) fn read(path: &Path) -> anyhow::Result<Statistics> {
 
 fn parse(
     target: &Target,
-) -> Result<(Measure, gump_metrics::statistics::Class, Distribution), String> {
+) -> Result<
+    (
+        Statistic,
+        gump_metrics::statistics::StatisticClass,
+        Distribution,
+    ),
+    String,
+> {
     let Target {
         measure: name,
         class,
         ..
     } = target;
-    let measure = Measure::of_name(name)
+    let measure = Statistic::of_name(name)
         .ok_or_else(|| format!("expected the name of a measure, found {name:?}"))?;
     let class = class_of_name(class).ok_or_else(|| {
         format!("expected scene, vehicle, pedestrian or bicycle, found {class:?}")
@@ -94,7 +101,7 @@ pub(crate) fn write(path: &Path, provenance: &str, statistics: &Statistics) -> a
     };
     let mut text = String::from(
         "# What a set of scenes is like, in numbers alone: `cargo xtask data stats PATH \
-         --against THIS_FILE`.\n# Bins are those of `gump_metrics::statistics::Measure`.\n\n",
+         --against THIS_FILE`.\n# Bins are those of `gump_metrics::statistics::Statistic`.\n\n",
     );
     text.push_str(&toml::to_string(&table)?);
     gump_data::write_atomically(path, |file| {
@@ -182,7 +189,7 @@ mod tests {
         let path = crate::machine::repository().join("configs/targets/waymo-like.toml");
         let targets = read(&path).unwrap();
         assert!(targets.scenes() >= 100);
-        let standing = targets.get(Measure::Standing, Some(gump_scene::AgentKind::Vehicle));
+        let standing = targets.get(Statistic::Standing, Some(gump_scene::AgentKind::Vehicle));
         assert!((0.6..0.9).contains(&standing.unwrap().mean()));
     }
 }

@@ -552,6 +552,75 @@ fn behaviour_after_the_log_has_no_log_and_shards_add_up() {
 }
 
 #[test]
+fn lights_are_counted_and_what_a_scene_lacks_is_noted() {
+    let folder = tempfile::tempdir().unwrap();
+    let scenario = gump_scene::fixture::scenario(
+        "lane 1: -60,0 -8,0 next 3
+         lane 2: 0,-60 0,-8 next 4
+         lane 3: -8,0 60,0
+         lane 4: 0,-8 0,60
+         light 1 green:
+         light 2 green:
+         light 9 red:
+         ego vehicle 0: -50,0 velocity 6,0
+         agent vehicle 1: 0,-40 velocity 0,6
+         history 1 future 9 dt 0.1",
+    )
+    .unwrap();
+    let path = folder.path().join("crossing.json");
+    gump_data::scenario_json::write_scenario(&path, &scenario).unwrap();
+    let words = "evaluate behaviour --scenarios crossing.json --world log,idm --futures 4 \
+                 --seconds 30";
+    let found = results(&folder, words, "out");
+    let notes = [("unmapped_light", 1), ("contradicting_lights", 1)];
+    let check = |found: &Value| {
+        let rows = found["notes"].as_array().unwrap().iter();
+        let rows: Vec<_> = rows
+            .map(|row| {
+                (
+                    row["note"].as_str().unwrap(),
+                    row["cases"].as_u64().unwrap(),
+                )
+            })
+            .collect();
+        assert_eq!(rows, notes);
+    };
+    check(&found);
+    assert!(folder.path().join("out/notes.parquet").is_file());
+    let rows = &found["rows"];
+    // The log contradicts itself throughout, the world never.
+    let conflict = row(rows, "idm", "conflicting_green", "light", 30);
+    assert_eq!(
+        (&conflict["value"], &conflict["log"]),
+        (&0.0.into(), &1.0.into())
+    );
+    for measure in ["red_phase_s", "green_phase_s", "light_change"] {
+        let value = row(rows, "idm", measure, "light", 30)["value"].as_f64();
+        assert!(
+            value.is_some_and(|value| value > 1.0),
+            "{measure}: {value:?}"
+        );
+    }
+    let stands = row(rows, "idm", "free_road_standing", "vehicle", 30);
+    assert!(
+        stands["value"].is_number() && stands["log"].is_null(),
+        "{stands}"
+    );
+    let shown = run(&folder, &format!("{words} --out shown"));
+    let shown = String::from_utf8(shown.stdout).unwrap();
+    for part in [
+        "conflicting_green",
+        "note: 1 lights of lanes that the map does not have",
+    ] {
+        assert!(shown.contains(part), "{part}: {shown}");
+    }
+    let words = "simulate --scenario crossing.json --world idm --futures 1 --seconds 2";
+    check(&results(&folder, words, "simulated"));
+    let held = results(&folder, &format!("{words} --lights hold"), "held");
+    assert!(held.get("notes").is_none(), "{held}");
+}
+
+#[test]
 fn behaviour_refuses_what_it_cannot_count() {
     let folder = tempfile::tempdir().unwrap();
     let verb = format!("evaluate behaviour --scenarios {}", mini());

@@ -8,13 +8,13 @@
 //! |---|---|
 //! | `console` | `$ cargo xtask ...` is run, in order, in a folder of the chapter's own; every other line occurs in the output of the command above it, spaces aside |
 //! | `LANGUAGE FILE` | written to that folder under this name |
-//! | `sh`, `yaml` | not run: a cluster, a long job, data of one's own. Flags of `cargo xtask` are checked, shell syntax too |
+//! | `sh`, `yaml` | not run: a cluster, a long job, data of one's own. Flags of `cargo xtask` are checked, shell syntax too; those of the page on clusters run with stand-ins for their schedulers |
 //! | others | for reading |
 #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
-use std::os::unix::fs::symlink;
+use std::os::unix::fs::{PermissionsExt as _, symlink};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
@@ -122,6 +122,222 @@ fn commands_that_are_not_run_have_flags_that_exist() {
         }
     }
     assert!(n_commands >= 20, "only {n_commands} commands found");
+}
+
+/// The driver, but with simple worlds and planners in place of networks, which take too long for a
+/// test.
+const QUICK_DRIVER: &str = r#"#!/bin/bash
+words=("${@/#model:*/idm}")
+words=("${words[@]/#idm,model:*/log,idm}")
+words=("${words[@]/#pdm-closed,interactive/simple,idm}")
+case "$2" in
+wosac) words+=(--rollouts-per-scenario 1) ;;
+closed-loop) words+=(--seconds 1 --films 0) ;;
+esac
+exec "$REAL_DRIVER" "${words[@]}"
+"#;
+
+/// Starts a script for every element of an array of two; runs the command of `--wrap` at once.
+const SBATCH: &str = r#"#!/bin/bash
+case "$*" in
+*--wrap*) exec bash -c "${@: -1}" ;;
+esac
+export SLURM_ARRAY_TASK_MIN=1 SLURM_ARRAY_TASK_STEP=1 SLURM_ARRAY_TASK_COUNT=2
+for element in 1 2; do
+    SLURM_ARRAY_TASK_ID=$element SLURM_PROCID=0 bash "${@: -1}" >&2 || exit 1
+done
+echo 17
+"#;
+
+/// Runs a command in `SLURM_NTASKS` tasks at the same time.
+const SRUN: &str = r#"#!/bin/bash
+for ((k = 0; k < SLURM_NTASKS; k++)); do
+    SLURM_PROCID=$k "$@" &
+    tasks+=($!)
+done
+for task in "${tasks[@]}"; do wait "$task" || exit 1; done
+"#;
+
+/// Runs a command of `bash` in as many processes as `-n` says, one after another.
+const MPIRUN: &str = r#"#!/bin/bash
+n=$2
+while [ "$1" != bash ]; do shift; done
+for ((k = 0; k < n; k++)); do
+    OMPI_COMM_WORLD_RANK=$k "$@" || exit 1
+done
+"#;
+
+/// Calls tasks where they are made.
+const RAY: &str = "\
+def remote(**options):
+    return lambda task: type('Task', (), {'remote': staticmethod(task)})
+
+
+def init():
+    pass
+
+
+def get(results):
+    return results
+";
+
+/// A folder with the programs of clusters and scenes, and the page that says how to use them.
+struct Cluster {
+    place: tempfile::TempDir,
+    page: PathBuf,
+    blocks: Vec<Block>,
+}
+
+impl Cluster {
+    /// How many scenes there are.
+    const N_SCENES: usize = 8;
+
+    fn new() -> Self {
+        let place = tempfile::tempdir().unwrap();
+        let page = book().join("evaluate-over-a-cluster.md");
+        let blocks = blocks(&page);
+        let cluster = Self {
+            place,
+            page,
+            blocks,
+        };
+        fs::create_dir(cluster.path("programs")).unwrap();
+        for (name, script) in [
+            ("gump", QUICK_DRIVER),
+            ("sbatch", SBATCH),
+            ("srun", SRUN),
+            ("mpirun", MPIRUN),
+        ] {
+            let path = cluster.path("programs").join(name);
+            fs::write(&path, script).unwrap();
+            fs::set_permissions(&path, fs::Permissions::from_mode(0o755)).unwrap();
+        }
+        fs::write(cluster.path("ray.py"), RAY).unwrap();
+        fs::create_dir(cluster.path("validation")).unwrap();
+        let scenes = "sumo-peachtree.tfrecord.gz";
+        let shipped = root().join("datasets/mini").join(scenes);
+        fs::copy(shipped, cluster.path("validation").join(scenes)).unwrap();
+        cluster
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.place.path().join(name)
+    }
+
+    /// The text of the only block of a language with this part.
+    fn block(&self, info: &str, part: &str) -> String {
+        let blocks = self.blocks.iter().filter(|block| block.info == info);
+        let texts = blocks.map(|block| block.lines.join("\n"));
+        let mut found: Vec<String> = texts.filter(|text| text.contains(part)).collect();
+        assert_eq!(found.len(), 1, "{info} blocks with {part}");
+        found.remove(0)
+    }
+
+    /// Runs a program in the environment that the page supposes, with `out` for results.
+    fn run(&self, program: &str, words: &[&str], out: &str, variables: &[(&str, &str)]) {
+        let path = std::env::var("PATH").unwrap();
+        let programs = self.path("programs");
+        let output = Command::new(program)
+            .args(words)
+            .current_dir(self.place.path())
+            .env("PATH", format!("{}:{path}", programs.display()))
+            .env("CARGO_MANIFEST_DIR", env!("CARGO_MANIFEST_DIR"))
+            .env("REAL_DRIVER", env!("CARGO_BIN_EXE_xtask"))
+            .env("XTASK", programs.join("gump"))
+            .env("SCENES", self.path("validation"))
+            .env("WEIGHTS", "w.safetensors")
+            .env("OUT", self.path(out))
+            .envs(variables.iter().copied())
+            .output()
+            .unwrap();
+        let error = String::from_utf8_lossy(&output.stderr);
+        assert!(output.status.success(), "{program} {words:?}: {error}");
+    }
+
+    /// Checks that there are these shards and that all scenes are in their sum.
+    fn check(&self, out: &str, shards: &[&str]) {
+        let folders = fs::read_dir(self.path(out)).unwrap();
+        let names = folders.map(|entry| entry.unwrap().file_name().into_string().unwrap());
+        let mut names: Vec<String> = names.collect();
+        names.sort();
+        assert_eq!(names, [&["merged"], shards].concat());
+        let report = fs::read_to_string(self.path(out).join("merged/report.json")).unwrap();
+        let report: serde_json::Value = serde_json::from_str(&report).unwrap();
+        let scenarios = &report["results"]["rows"][0]["scenarios"];
+        assert_eq!(*scenarios, Self::N_SCENES, "{out}");
+    }
+}
+
+#[test]
+fn scripts_for_slurm_keep_the_results_of_every_task() {
+    let cluster = Cluster::new();
+    let script = cluster.block("sh", "#SBATCH --array");
+    fs::write(cluster.path("wosac.sh"), script).unwrap();
+    let submit = cluster.block("sh", "sbatch --parsable");
+    for (n, shards) in [
+        ("1", &["shard-1-0", "shard-2-0"][..]),
+        ("2", &["shard-1-0", "shard-1-1", "shard-2-0", "shard-2-1"]),
+    ] {
+        let variables = [("SLURM_NTASKS", n), ("SLURM_CPUS_PER_TASK", "1")];
+        let out = format!("slurm-{n}");
+        cluster.run("bash", &["-ec", &submit], &out, &variables);
+        cluster.check(&out, shards);
+    }
+}
+
+#[test]
+fn pods_of_kubernetes_evaluate_their_shards() {
+    let cluster = Cluster::new();
+    let job = cluster.block("yaml", "kind: Job");
+    assert!(job.contains("command: [bash, -c]"), "{job}");
+    // The variable says what the job does.
+    let (_, count) = job.split_once("completions: ").unwrap();
+    let count = count.lines().next().unwrap();
+    let variable = format!("{{ name: GUMP_SHARDS, value: \"{count}\" }}");
+    assert!(job.contains(&variable), "expected {variable} in {job}");
+    // A folded scalar: its lines with spaces between them, as far as they are indented.
+    let (_, rest) = job.split_once("args:\n").unwrap();
+    let mut lines = rest.lines().skip(1);
+    let first = lines.next().unwrap();
+    let is_inside =
+        |line: &&str| line.starts_with(&first[..first.len() - first.trim_start().len()]);
+    let words = lines.take_while(is_inside).map(str::trim);
+    let command: Vec<&str> = [first.trim()].into_iter().chain(words).collect();
+    let data = cluster.place.path().display().to_string();
+    let here = |text: &str| text.replace("/data/", &format!("{data}/"));
+    let command = here(&command.join(" "));
+    for index in ["0", "1"] {
+        let variables = [("JOB_COMPLETION_INDEX", index), ("GUMP_SHARDS", "2")];
+        cluster.run("bash", &["-c", &command], "out", &variables);
+    }
+    let page = fs::read_to_string(&cluster.page).unwrap();
+    let (_, merge) = page.split_once("`gump evaluate merge").unwrap();
+    let merge = format!("gump evaluate merge{}", merge.split('`').next().unwrap());
+    cluster.run("bash", &["-c", &here(&merge)], "out", &[]);
+    cluster.check("out", &["shard-1", "shard-2"]);
+}
+
+#[test]
+fn processes_of_mpi_and_tasks_of_ray_evaluate_their_shards() {
+    let cluster = Cluster::new();
+    let shards = ["shard-1", "shard-2"];
+    let script = cluster
+        .block("sh", "OMPI_COMM_WORLD_RANK")
+        .replace("64", "2");
+    cluster.run("bash", &["-ec", &script], "mpi", &[]);
+    cluster.check("mpi", &shards);
+    let program = cluster.block("python", "import ray");
+    let program = format!(
+        "import os\nXTASK, SCENES, WEIGHTS, OUT = (os.environ[name] for name in \
+         ('XTASK', 'SCENES', 'WEIGHTS', 'OUT'))\n{}",
+        program.replace("SHARDS = 64", "SHARDS = 2")
+    );
+    if Command::new("python3").arg("--version").output().is_err() {
+        eprintln!("SKIPPED: no python3");
+        return;
+    }
+    cluster.run("python3", &["-c", &program], "ray", &[]);
+    cluster.check("ray", &shards);
 }
 
 /// The words after `cargo xtask`, or after the executable, of every command in a block.

@@ -5,7 +5,7 @@ use std::fmt;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use gump_scene::{MapError, ScenarioError};
+use gump_scene::{AgentId, MapError, ScenarioError};
 
 /// The location of a record: its file, index and offset.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -425,12 +425,51 @@ pub enum Problem {
         /// The part of the record.
         place: Box<str>,
     },
-    /// Rollouts do not fit their scenario.
-    #[error("{0}")]
-    Rollouts(String),
-    /// A message of predictions is inconsistent.
-    #[error("{0}")]
-    Predictions(String),
+    /// Rollouts are of another scenario.
+    #[error("expected rollouts of scenario {expected}, found {found}")]
+    OtherScenario {
+        /// Id of the scenario.
+        expected: Box<str>,
+        /// Id in the message.
+        found: Box<str>,
+    },
+    /// A future does not fit its scenario.
+    #[error("future {future}: {problem}")]
+    Future {
+        /// Index of the future.
+        future: usize,
+        /// The first problem with it.
+        problem: Box<str>,
+    },
+    /// A message of predictions has none.
+    #[error("expected single or joint predictions, found none")]
+    NoPredictions,
+    /// Modes of a joint prediction are of different agents.
+    #[error("mode {mode} is of other agents than mode 0, or of one agent twice")]
+    MixedAgents {
+        /// Index of the mode.
+        mode: usize,
+    },
+    /// A mode of a prediction lacks the trajectory of an agent.
+    #[error("mode {mode} of agent {agent} has no trajectory")]
+    NoTrajectory {
+        /// Index of the mode.
+        mode: usize,
+        /// The agent.
+        agent: AgentId,
+    },
+    /// A predicted trajectory has more positions in one direction than in the other.
+    #[error("mode {mode} of agent {agent} has {x} numbers center_x and {y} center_y")]
+    UnequalPositions {
+        /// Index of the mode.
+        mode: usize,
+        /// The agent.
+        agent: AgentId,
+        /// Positions along x.
+        x: usize,
+        /// Positions along y.
+        y: usize,
+    },
     /// The map is inconsistent.
     #[error(transparent)]
     Map(#[from] MapError),

@@ -165,5 +165,5 @@ fn real_submissions_read_as_rollouts_of_their_scenario() {
         return;
     };
     let error = rollouts_from_proto(&read_rollouts(&path).unwrap()[0], &other).unwrap_err();
-    assert!(matches!(error, Problem::Rollouts(_)));
+    assert!(matches!(error, Problem::OtherScenario { .. }));
 }

@@ -53,7 +53,10 @@ mod tests {
 
     #[test]
     fn an_error_of_the_network_is_told_as_it_is() {
-        let error = EngineError::from(ModelError::Config("no heads".into()));
+        let error = EngineError::from(ModelError::Config {
+            key: "heads",
+            reason: "no heads".into(),
+        });
         assert_eq!(error.to_string(), "configuration: no heads");
         let error = EngineError::TimeStep {
             dt: 0.3,

@@ -43,6 +43,8 @@
 #[cfg(feature = "tensors")]
 mod agreement;
 #[cfg(feature = "tensors")]
+mod counters;
+#[cfg(feature = "tensors")]
 pub mod cpu;
 #[cfg(feature = "tensors")]
 mod deconvolution;

@@ -17,8 +17,9 @@ use gump_tokenizer::{Slot, TokenFrame, TokenSequence};
 use rayon::prelude::*;
 
 use crate::EngineError;
-use crate::cpu::{Engine, Job, KvCache, SceneMemory};
-use crate::predictive_samples::{Seen, requests};
+use crate::counters::CountedEngine;
+use crate::cpu::{Job, KvCache, SceneMemory};
+use crate::predictive_samples::{ObjectDraws, requests};
 use crate::redraw::RejectionSampler;
 use crate::request::Request;
 use crate::sampling::{CacheMode, Mode, SamplingConfig};
@@ -75,7 +76,7 @@ pub(crate) fn presented(
 
 /// The windows of one step, in the engine.
 pub(crate) struct Step<'a> {
-    pub(crate) engine: &'a Engine,
+    pub(crate) engine: &'a CountedEngine<'a>,
     pub(crate) sampling: &'a SamplingConfig,
     /// By scene.
     pub(crate) memories: &'a [&'a SceneMemory],
@@ -83,17 +84,15 @@ pub(crate) struct Step<'a> {
     /// Their slots, as [`presented`].
     pub(crate) placed: Vec<Vec<PlacedSlot>>,
     /// Settings of predictive samples.
-    pub(crate) watch: ProbeConfig,
+    pub(crate) probe: ProbeConfig,
 }
 
 /// The decoded next frame of every window.
 pub(crate) struct Decoded {
     /// One chunk of bins per tracked agent of every window.
     pub(crate) bins: Vec<Vec<Bins>>,
-    /// Number of transformer passes.
-    pub(crate) passes: u64,
     /// Predictive samples, as far as requested.
-    pub(crate) seen: Vec<Seen>,
+    pub(crate) seen: Vec<ObjectDraws>,
 }
 
 impl Step<'_> {
@@ -107,15 +106,15 @@ impl Step<'_> {
 
     /// Draws predictive samples of an object, as many as requested; `hidden` is the vector at its
     /// key. They use separate streams, so the simulated draws do not change.
-    fn look(&self, window: usize, place: usize, hidden: &[f32]) -> Option<Seen> {
+    fn look(&self, window: usize, place: usize, hidden: &[f32]) -> Option<ObjectDraws> {
         let request = &self.windows[window].requests[place];
-        if window >= self.watch.futures || request.is_driven() {
+        if window >= self.probe.futures || request.is_driven() {
             return None;
         }
-        let requests: Vec<Request> = requests(self.watch, request).collect();
+        let requests: Vec<Request> = requests(self.probe, request).collect();
         let requests: Vec<&Request> = requests.iter().collect();
         let rows = hidden.repeat(requests.len());
-        Some(Seen {
+        Some(ObjectDraws {
             window,
             place,
             bins: self.engine.sample(&rows, &requests, self.sampling),
@@ -165,15 +164,13 @@ impl Step<'_> {
         };
         let Ok(()) =
             RejectionSampler::new(self.windows, self.sampling).resolve(&mut decoded, again);
-        let watched = self.windows.iter().take(self.watch.futures).enumerate();
-        let watched =
-            watched.flat_map(|(w, window)| (0..window.next.tracked.len()).map(move |i| (w, i)));
-        let seen =
-            watched.filter_map(|(w, i)| self.look(w, i, &hidden[(firsts[w] + i) * c..][..c]));
+        let probed = self.windows.iter().take(self.probe.futures).enumerate();
+        let probed =
+            probed.flat_map(|(w, window)| (0..window.next.tracked.len()).map(move |i| (w, i)));
+        let seen = probed.filter_map(|(w, i)| self.look(w, i, &hidden[(firsts[w] + i) * c..][..c]));
         Decoded {
             seen: seen.collect(),
             bins: decoded,
-            passes: 1,
         }
     }
 
@@ -239,7 +236,6 @@ impl Step<'_> {
         }
         Decoded {
             bins: decoded,
-            passes: most as u64,
             seen,
         }
     }

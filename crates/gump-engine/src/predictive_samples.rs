@@ -11,19 +11,19 @@ use crate::request::Request;
 
 /// Draws of an object: its window, its index there, and a chunk of bins each.
 #[derive(Debug)]
-pub(crate) struct Seen {
+pub(crate) struct ObjectDraws {
     pub(crate) window: usize,
     pub(crate) place: usize,
     pub(crate) bins: Vec<Bins>,
 }
 
 /// Separates the streams of predictive samples from those of fields and redraws (from 2^20 on).
-const WATCH: u64 = 1 << 40;
+const SAMPLE_STREAMS: u64 = 1 << 40;
 
 /// The same request many times, each with its own random stream.
 pub(crate) fn requests(probe: ProbeConfig, request: &Request) -> impl Iterator<Item = Request> {
     (0..probe.draws as u64).map(|i| Request {
-        stream: request.stream.fork(WATCH + i),
+        stream: request.stream.fork(SAMPLE_STREAMS + i),
         ..request.clone()
     })
 }

@@ -21,7 +21,7 @@ use gump_tokenizer::{
 
 use crate::EngineError;
 use crate::cpu::{KvCache, SceneMemory};
-use crate::placement::ground::Ground;
+use crate::placement::spawn_map::SpawnMap;
 use crate::world::TransformerWorld;
 
 /// The encoding of a map, in the form of the implementation that uses it.
@@ -73,9 +73,9 @@ pub struct SceneContext {
     pub lane_map: Arc<LaneMap>,
     pub(crate) route: Option<Arc<Route>>,
     /// Valid positions by class; computed on first use.
-    grounds: [OnceLock<Arc<Ground>>; N_CLASSES],
+    grounds: [OnceLock<Arc<SpawnMap>>; N_CLASSES],
     /// The part of them where agents may enter the window.
-    entries: [OnceLock<Arc<Ground>>; N_CLASSES],
+    entries: [OnceLock<Arc<SpawnMap>>; N_CLASSES],
 }
 
 /// The sequence of shared frames.
@@ -182,14 +182,14 @@ impl SceneContext {
     }
 
     /// Valid positions of agents of a class.
-    pub(crate) fn ground(&self, kind: AgentKind) -> Arc<Ground> {
+    pub(crate) fn ground(&self, kind: AgentKind) -> Arc<SpawnMap> {
         let ground = &self.grounds[class_index(kind)];
-        let make = || Arc::new(Ground::of_class(&self.map, self.world_from_scene, kind));
+        let make = || Arc::new(SpawnMap::of_class(&self.map, self.world_from_scene, kind));
         Arc::clone(ground.get_or_init(make))
     }
 
     /// Positions where agents of a class may enter the window.
-    pub(crate) fn entries(&self, kind: AgentKind) -> Arc<Ground> {
+    pub(crate) fn entries(&self, kind: AgentKind) -> Arc<SpawnMap> {
         let make = || Arc::new(self.ground(kind).entries());
         Arc::clone(self.entries[class_index(kind)].get_or_init(make))
     }

@@ -5,14 +5,15 @@ use std::sync::Arc;
 use gump_model::decoder::Bins;
 use gump_model::mct::VisualMemory;
 use gump_model::steps::TOKEN_DT;
-use gump_rollout::{BoxError, PredictiveSamples, ProbeConfig, Session, Start};
+use gump_rollout::{BoxError, PredictiveSamples, ProbeConfig, Session, SessionStats, Start};
 use gump_scene::{AgentState, Frame};
 use rayon::prelude::*;
 
 use crate::EngineError;
+use crate::counters::Counters;
 use crate::cpu::SceneMemory;
 use crate::partial_ar::{Step, Window, present_all};
-use crate::predictive_samples::Seen;
+use crate::predictive_samples::ObjectDraws;
 use crate::reference::{Passes, decode};
 use crate::rollout_state::RolloutState;
 use crate::scene::SceneContext;
@@ -32,6 +33,7 @@ pub(crate) struct TransformerSession<'a> {
     /// Settings of predictive samples, and those recorded.
     pub(crate) probe: ProbeConfig,
     pub(crate) samples: Vec<PredictiveSamples>,
+    pub(crate) counters: Counters,
 }
 
 impl Session for TransformerSession<'_> {
@@ -94,10 +96,17 @@ impl Session for TransformerSession<'_> {
         std::mem::take(&mut self.samples)
     }
 
+    fn stats(&self) -> SessionStats {
+        self.counters.stats()
+    }
+
     fn replace(&mut self, future: usize, start: Start<'_>) -> Result<(), BoxError> {
         let index = self.scenes.len();
         let mut scene = SceneContext::new(self.world, start.scene)?;
-        let mut fresh = self.world.futures(index, &mut scene, 1, start.seed)?;
+        let counters = &self.counters;
+        let mut fresh = self
+            .world
+            .futures(index, &mut scene, 1, start.seed, counters)?;
         self.scenes.push(scene);
         self.futures[future] = fresh.pop().expect("one future was asked for");
         self.forget_unused_scenes();
@@ -152,7 +161,7 @@ impl TransformerSession<'_> {
     fn decode(&mut self, windows: &[Window]) -> Result<Vec<Vec<Bins>>, EngineError> {
         let (network, sampling) = (self.world.network(), self.world.sampling());
         let placed = present_all(windows, network.config().block_size)?;
-        let Some(engine) = self.world.engine() else {
+        let Some(engine) = self.world.counted_engine(&self.counters) else {
             let memories = self
                 .scenes
                 .iter()
@@ -160,24 +169,23 @@ impl TransformerSession<'_> {
             let memories: Vec<&VisualMemory> = memories.collect();
             let passes = Passes::new(network, sampling, &memories);
             let decoded = decode(&passes, windows, &placed);
-            self.world.count_passes(passes.count());
+            self.counters.count_passes(passes.count());
             return decoded;
         };
         let memories = self.scenes.iter().filter_map(|scene| scene.memory.packed());
         let memories: Vec<&SceneMemory> = memories.collect();
         let mut kv_caches: Vec<_> = self.futures.iter_mut().map(|f| &mut f.kv_cache).collect();
         let step = Step {
-            engine,
+            engine: &engine,
             sampling,
             memories: &memories,
             windows,
             placed,
-            watch: self.probe,
+            probe: self.probe,
         };
         let decoded = step.decode(&mut kv_caches);
-        self.world.count_passes(decoded.passes);
         let kept = kv_caches.iter().map(|kv_cache| kv_cache.bytes()).sum();
-        self.world.note_context_bytes(kept);
+        self.counters.note_cache_bytes(kept);
         let seen = decoded.seen.iter();
         let samples: Vec<_> = seen
             .filter_map(|seen| self.samples_of(seen, windows))
@@ -187,7 +195,7 @@ impl TransformerSession<'_> {
     }
 
     /// Draws of an object in the world frame.
-    fn samples_of(&self, seen: &Seen, windows: &[Window]) -> Option<PredictiveSamples> {
+    fn samples_of(&self, seen: &ObjectDraws, windows: &[Window]) -> Option<PredictiveSamples> {
         let future = &self.futures[seen.window];
         let scene = &self.scenes[future.scene];
         let window = &windows[seen.window];

@@ -27,7 +27,8 @@ use gump_model::local_frame::LocalFrame;
 use gump_model::placed_slot::{PlacedSlot, place_exactly};
 
 use crate::EngineError;
-use crate::cpu::{Engine, Job, KvCache};
+use crate::counters::CountedEngine;
+use crate::cpu::{Job, KvCache};
 use crate::nucleus::uniform;
 use crate::partial_ar::{Window, present_all};
 use crate::placement::births::{BEGIN_AT, next_key, stays};
@@ -61,7 +62,7 @@ enum About {
 impl TransformerSession<'_> {
     /// Draws the lights of the next frames and removes agents that have left.
     pub(crate) fn before_decoding(&mut self, windows: &mut [Window]) -> Result<(), EngineError> {
-        let Some(engine) = self.world.engine() else {
+        let Some(engine) = &self.world.counted_engine(&self.counters) else {
             let what = "traffic lives";
             return Err(EngineError::NotOnCpu { what });
         };
@@ -77,7 +78,7 @@ impl TransformerSession<'_> {
     /// always are.
     fn despawn(
         &self,
-        engine: &Engine,
+        engine: &CountedEngine<'_>,
         windows: &mut [Window],
         placed: &[Vec<PlacedSlot>],
         kv_caches: &mut [KvCache],
@@ -124,7 +125,7 @@ impl TransformerSession<'_> {
     /// Hidden vectors of some windows at some slots, one pass for all.
     fn run(
         &self,
-        engine: &Engine,
+        engine: &CountedEngine<'_>,
         windows: &[Window],
         placed: &[Vec<PlacedSlot>],
         kv_caches: &mut [KvCache],
@@ -150,9 +151,6 @@ impl TransformerSession<'_> {
                 keep: true,
             });
         }
-        if !jobs.is_empty() {
-            self.world.count_passes(1);
-        }
         engine.run(&mut jobs)
     }
 
@@ -163,7 +161,8 @@ impl TransformerSession<'_> {
             let scene = &self.scenes[future.scene];
             *frame = future.without_the_gone(frame, scene);
         }
-        let engine = self.world.engine().expect("checked before decoding");
+        let engine = self.world.counted_engine(&self.counters);
+        let engine = &engine.expect("checked before decoding");
         let arrivals = self.world.sampling().spawn_rates.arrivals;
         let mut open: Vec<usize> = (0..self.futures.len()).collect();
         let mut kv_caches: Vec<KvCache> = self.futures.iter().map(|f| f.kv_cache.clone()).collect();
@@ -200,7 +199,7 @@ impl TransformerSession<'_> {
     /// Hidden vectors at the last slot of some futures.
     fn read(
         &self,
-        engine: &Engine,
+        engine: &CountedEngine<'_>,
         kv_caches: &mut [KvCache],
         members: &[usize],
         slots: &[Vec<PlacedSlot>],
@@ -220,9 +219,6 @@ impl TransformerSession<'_> {
                 keep: true,
             });
         }
-        if !jobs.is_empty() {
-            self.world.count_passes(1);
-        }
         engine.run(&mut jobs)
     }
 
@@ -230,7 +226,7 @@ impl TransformerSession<'_> {
     /// enters in that frame.
     fn spawn(
         &mut self,
-        engine: &Engine,
+        engine: &CountedEngine<'_>,
         kv_caches: &mut [KvCache],
         open: &mut Vec<usize>,
         coming: Vec<(usize, AgentKind, Seed)>,

@@ -169,8 +169,7 @@ pub(crate) fn imagine(
     let frames = (0..steps)
         .map(|_| session.step(ego.as_deref()).unwrap())
         .collect();
-    drop(session);
-    (frames, world.passes())
+    (frames, session.stats().passes)
 }
 
 #[test]
@@ -182,6 +181,30 @@ fn partial_ar_takes_one_pass_per_frame() {
         ..SamplingConfig::default()
     };
     assert_eq!(imagine(full, &scenario(), 4, 3, None).1, 1 + 3 * 5);
+}
+
+#[test]
+fn sessions_count_their_own_work() {
+    let scenario = scenario();
+    let start = Start {
+        scene: scenario.present(),
+        n_futures: 2,
+        seed: Seed(5),
+    };
+    let world = TransformerWorld::new(network(), SamplingConfig::default());
+    let mut one = world.open(&[start]).unwrap();
+    let opened = one.stats();
+    assert!(opened.passes == 1 && opened.operations > 0);
+    let mut other = world.open(&[start]).unwrap();
+    for _ in 0..2 {
+        other.step(None).unwrap();
+    }
+    assert_eq!(one.stats(), opened);
+    one.step(None).unwrap();
+    assert_eq!(one.stats().passes, 2);
+    assert_eq!(other.stats().passes, 3);
+    assert!(one.stats().operations < other.stats().operations);
+    assert!(one.stats().cache_bytes > 0);
 }
 
 #[test]
@@ -231,7 +254,7 @@ fn starts_of_one_scene_share_what_they_look_at() {
     };
     let mut shared = world.open(&[start(5), start(5), start(6)]).unwrap();
     // The history is read once for each seed, not for each start.
-    assert_eq!(world.passes(), 2);
+    assert_eq!(shared.stats().passes, 2);
     let mut single = world.open(&[start(6)]).unwrap();
     for _ in 0..3 {
         let frames = shared.step(None).unwrap();
@@ -575,12 +598,15 @@ fn parameters_of_the_larger_sizes_match_too() {
 
 #[test]
 fn contradictory_configurations_are_named() {
-    let check = |config: ModelConfig, expected: &str| match Network::random(
+    let check = |config: ModelConfig, at_fault: &str, expected: &str| match Network::random(
         config,
         Seed(0),
         &Device::Cpu,
     ) {
-        Err(ModelError::Config(what)) => assert!(what.contains(expected), "{what}"),
+        Err(ModelError::Config { key, reason }) => {
+            assert_eq!(key, at_fault);
+            assert!(reason.contains(expected), "{reason}");
+        }
         other => panic!("expected a configuration error, found {other:?}"),
     };
     check(
@@ -588,6 +614,7 @@ fn contradictory_configurations_are_named() {
             heads: 5,
             ..ModelConfig::tiny()
         },
+        "heads",
         "multiple of 5 heads",
     );
     check(
@@ -595,6 +622,7 @@ fn contradictory_configurations_are_named() {
             trajectory_heads: vec![4],
             ..ModelConfig::tiny()
         },
+        "trajectory_heads",
         "after block 4",
     );
     let mut visual = ModelConfig::tiny().visual;
@@ -604,6 +632,7 @@ fn contradictory_configurations_are_named() {
             visual,
             ..ModelConfig::tiny()
         },
+        "visual.layers",
         "unicorns",
     );
 }

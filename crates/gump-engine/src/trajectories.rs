@@ -84,7 +84,6 @@ impl TransformerWorld {
         };
         let batch = network.pack(&[&slots], 0, memory)?;
         let features = network.mct.forward(&batch, memory, None, None)?;
-        self.count_passes(1);
         let level = features.levels.last();
         let level = level.expect("a level for every head").squeeze(0)?; // [T, C]
         let at = |offset: u32| {

@@ -10,7 +10,6 @@
 //! one that moves into the window is controlled by the network from then on.
 
 use std::collections::BTreeMap;
-use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 
 use candle_core::Tensor;
 use gump_model::Network;
@@ -23,6 +22,7 @@ use gump_tokenizer::{QuantizedState, Slot, Tokenizer, TokenizerConfig};
 use rayon::prelude::*;
 
 use crate::EngineError;
+use crate::counters::{CountedEngine, Counters};
 use crate::cpu::{Engine, Job};
 use crate::reference::sample_states;
 use crate::request::Request;
@@ -41,8 +41,6 @@ pub struct TransformerWorld {
     tokenizer: Tokenizer,
     /// On a CPU, unless the tensor library was requested.
     engine: Option<Engine>,
-    passes: AtomicU64,
-    context_bytes: AtomicUsize,
 }
 
 impl TransformerWorld {
@@ -67,33 +65,12 @@ impl TransformerWorld {
             sampling,
             tokenizer: Tokenizer::new(TokenizerConfig::default()),
             engine: None,
-            passes: AtomicU64::new(0),
-            context_bytes: AtomicUsize::new(0),
         }
-    }
-
-    /// Transformer passes so far, whatever their batch size; the first of a session computes the
-    /// history.
-    pub fn passes(&self) -> u64 {
-        self.passes.load(Ordering::Relaxed)
-    }
-
-    /// Floating-point operations of the engine so far, counting a multiplication and an addition
-    /// each; without visual encoding. 0 without the engine.
-    pub fn operations(&self) -> u64 {
-        self.engine
-            .as_ref()
-            .map_or(0, |engine| 2 * engine.products())
     }
 
     /// Bytes of the matrices that the engine multiplies; 0 without it.
     pub fn weight_bytes(&self) -> usize {
         self.engine.as_ref().map_or(0, Engine::weight_bytes)
-    }
-
-    /// The maximum of the bytes of keys and values that the futures of a session have held at once.
-    pub fn context_bytes(&self) -> usize {
-        self.context_bytes.load(Ordering::Relaxed)
     }
 
     /// The network.
@@ -115,13 +92,11 @@ impl TransformerWorld {
         self.engine.as_ref()
     }
 
-    pub(crate) fn note_context_bytes(&self, bytes: usize) {
-        self.context_bytes.fetch_max(bytes, Ordering::Relaxed);
-    }
-
-    /// Adds passes of the network to those counted.
-    pub fn count_passes(&self, n: u64) {
-        self.passes.fetch_add(n, Ordering::Relaxed);
+    /// The CPU engine as a session with these counters uses it.
+    pub(crate) fn counted_engine(&self, counters: &Counters) -> Option<CountedEngine<'_>> {
+        let counters = counters.clone();
+        self.engine()
+            .map(|engine| CountedEngine { engine, counters })
     }
 
     /// Slots a frame may take, so that it and the one before it fit the block.
@@ -152,6 +127,7 @@ impl TransformerWorld {
             .par_iter()
             .map(|scene| SceneContext::new(self, *scene));
         let mut scenes: Vec<SceneContext> = scenes.collect::<Result<_, _>>()?;
+        let counters = Counters::default();
         let mut futures: Vec<Vec<RolloutState>> = Vec::with_capacity(starts.len());
         for (i, start) in starts.iter().enumerate() {
             let (scene, n) = (scene_of[i], start.n_futures);
@@ -161,7 +137,7 @@ impl TransformerWorld {
             };
             futures.push(match (0..i).find(like) {
                 Some(twin) => futures[twin].clone(),
-                None => self.futures(scene, &mut scenes[scene], n, start.seed)?,
+                None => self.futures(scene, &mut scenes[scene], n, start.seed, &counters)?,
             });
         }
         Ok(TransformerSession {
@@ -170,6 +146,7 @@ impl TransformerWorld {
             futures: futures.into_iter().flatten().collect(),
             probe: ProbeConfig::default(),
             samples: Vec::new(),
+            counters,
         })
     }
 
@@ -180,8 +157,9 @@ impl TransformerWorld {
         shared: &mut SceneContext,
         n: usize,
         seed: Seed,
+        counters: &Counters,
     ) -> Result<Vec<RolloutState>, EngineError> {
-        let chunks = self.first_chunks(shared, n, seed)?;
+        let chunks = self.first_chunks(shared, n, seed, counters)?;
         let last = shared
             .history
             .last()
@@ -214,6 +192,7 @@ impl TransformerWorld {
         scene: &mut SceneContext,
         n: usize,
         seed: Seed,
+        counters: &Counters,
     ) -> Result<Vec<Vec<(u16, Chunk)>>, EngineError> {
         let network = &self.network;
         let slots = scene.slots()?;
@@ -248,8 +227,10 @@ impl TransformerWorld {
             })
             .collect();
         let places: Vec<usize> = keys.iter().map(|(i, ..)| *i).collect();
-        let hidden = self.read_history(scene, &slots, places)?.repeat(n);
-        let bins = match &self.engine {
+        let hidden = self
+            .read_history(scene, &slots, places, counters)?
+            .repeat(n);
+        let bins = match self.counted_engine(counters) {
             Some(engine) => {
                 let requests: Vec<&Request> = requests.iter().collect();
                 engine.sample(&hidden, &requests, &self.sampling)
@@ -276,9 +257,10 @@ impl TransformerWorld {
         scene: &mut SceneContext,
         slots: &[PlacedSlot],
         places: Vec<usize>,
+        counters: &Counters,
     ) -> Result<Vec<f32>, EngineError> {
-        self.count_passes(1);
-        if let (Some(engine), Memory::Packed(memory)) = (&self.engine, &scene.memory) {
+        let engine = self.counted_engine(counters);
+        if let (Some(engine), Memory::Packed(memory)) = (engine, &scene.memory) {
             return Ok(engine.run(&mut [Job {
                 slots,
                 wanted: places,
@@ -289,6 +271,7 @@ impl TransformerWorld {
         }
         let memory = scene.memory.reference();
         let memory = memory.expect("without an engine the memory is the tensor library's");
+        counters.count_passes(1);
         let batch = self.network.pack(&[slots], 0, memory)?;
         let features = self.network.mct.forward(&batch, memory, None, None)?;
         let places: Vec<u32> = places.into_iter().map(|i| i as u32).collect();
@@ -307,7 +290,7 @@ impl TransformerWorld {
         let slots = scene.slots()?;
         let key = slots.iter().rposition(|p| matches!(p.slot, Slot::Key(_)));
         let key = key.expect("the ego is in every frame of the window");
-        let mut values = self.read_history(&mut scene, &slots, vec![key])?;
+        let mut values = self.read_history(&mut scene, &slots, vec![key], &Counters::default())?;
         let network = &self.network;
         let hidden = Tensor::from_slice(&values, (1, values.len()), network.device())?;
         let decoder = &network.decoder;

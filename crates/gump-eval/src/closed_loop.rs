@@ -6,7 +6,7 @@
 //! in [`gump_planner::closed_loop`].
 
 use std::collections::BTreeMap;
-use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::fs;
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
@@ -19,11 +19,11 @@ use gump_scene::Seed;
 use serde::{Deserialize, Serialize};
 
 use crate::error::sentence;
-use crate::planners::{PlannerConfig, PlannerName, PlanningWorld, TimedDriver};
+use crate::planners::{PlannerConfig, PlannerName, PlanningWorld, TimedDriver, catch_panics};
 use crate::recordings::{Case, Named};
 use crate::results::{Entry, ResultStore};
 use crate::worlds::WorldName;
-use crate::{EvalError, Monitor, ResumePoint};
+use crate::{EvalError, Monitor, ResumePoint, digest};
 
 /// Name of the benchmark in stored results.
 pub const BENCHMARK: &str = "closed-loop";
@@ -51,6 +51,33 @@ pub struct ClosedLoopSettings {
     pub sampling: String,
     /// The seed, in decimal digits.
     pub seed: String,
+    /// Those of [`checksums`]; none as of version 0.1.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub checksums: BTreeMap<String, String>,
+}
+
+/// Checksums of what drives depend on and names do not tell, as they are stored under
+/// [`CHECKSUMS`](crate::results::CHECKSUMS): SHA-256 of the ids of the scenarios in their order, and
+/// of the weights of each learned world by its name.
+///
+/// # Errors
+/// Weights that cannot be read.
+pub fn checksums<'a>(
+    ids: &[String],
+    worlds: impl IntoIterator<Item = &'a WorldName>,
+) -> Result<BTreeMap<String, String>, EvalError> {
+    let of_ids = digest::of_bytes(ids.join("\n").as_bytes());
+    let mut checksums = BTreeMap::from([("scenario_ids".to_owned(), of_ids)]);
+    for world in worlds {
+        let name = world.to_string();
+        if let WorldName::Model(path) = world
+            && !checksums.contains_key(&name)
+        {
+            let weights = fs::read(path).map_err(|cause| EvalError::io("read", path, cause))?;
+            checksums.insert(name, digest::of_bytes(&weights));
+        }
+    }
+    Ok(checksums)
 }
 
 /// The drives through one scenario.
@@ -120,6 +147,42 @@ pub enum EvaluatedPlanner<'a> {
     Custom(&'a dyn PlannerFactory),
 }
 
+impl From<PlannerName> for EvaluatedPlanner<'_> {
+    fn from(planner: PlannerName) -> Self {
+        Self::Named(planner)
+    }
+}
+
+impl<'a> EvaluatedPlanner<'a> {
+    /// Its name in results.
+    pub fn name(&self) -> String {
+        match self {
+            Self::Named(planner) => planner.name().into(),
+            Self::Custom(planner) => planner.name(),
+        }
+    }
+
+    pub(crate) fn is_parallel(&self) -> bool {
+        match self {
+            Self::Named(_) => true,
+            Self::Custom(planner) => planner.is_parallel(),
+        }
+    }
+
+    pub(crate) fn build(
+        &self,
+        case: &Case,
+        imagination: &'a dyn WorldModel,
+        seed: Seed,
+        config: &PlannerConfig,
+    ) -> Result<Box<dyn Explain + 'a>, BoxError> {
+        match self {
+            Self::Named(planner) => Ok(planner.build(case, imagination, seed, config)?),
+            Self::Custom(planner) => planner.build(case, seed),
+        }
+    }
+}
+
 /// The planner of a row: a requested one, or a single proposal.
 enum RowPlanner<'a> {
     Requested(EvaluatedPlanner<'a>),
@@ -132,8 +195,7 @@ enum RowPlanner<'a> {
 impl RowPlanner<'_> {
     fn name(&self) -> String {
         match *self {
-            Self::Requested(EvaluatedPlanner::Named(planner)) => planner.name().into(),
-            Self::Requested(EvaluatedPlanner::Custom(planner)) => planner.name(),
+            Self::Requested(ref planner) => planner.name(),
             Self::Proposal {
                 speed_fraction,
                 lateral_offset,
@@ -280,10 +342,7 @@ impl ClosedLoopEvaluation<'_> {
     }
 
     fn is_parallel(&self) -> bool {
-        self.planners.iter().all(|planner| match planner {
-            EvaluatedPlanner::Named(_) => true,
-            EvaluatedPlanner::Custom(planner) => planner.is_parallel(),
-        })
+        self.planners.iter().all(EvaluatedPlanner::is_parallel)
     }
 
     fn row_planners(&self) -> Vec<RowPlanner<'_>> {
@@ -306,8 +365,7 @@ impl ClosedLoopEvaluation<'_> {
         planners
     }
 
-    /// One drive with the milliseconds of a plan, or why it failed. A planner that panics has failed
-    /// like any other.
+    /// One drive with the milliseconds of a plan, or why it failed.
     fn drive<'p>(
         &'p self,
         planner: &RowPlanner<'p>,
@@ -330,17 +388,7 @@ impl ClosedLoopEvaluation<'_> {
             let milliseconds = timed.milliseconds_per_step();
             Ok((scored, milliseconds))
         };
-        match catch_unwind(AssertUnwindSafe(drive)) {
-            Ok(driven) => driven.map_err(|error| sentence(&*error)),
-            Err(panic) => {
-                let message = panic
-                    .downcast_ref::<&str>()
-                    .map(|text| (*text).to_owned())
-                    .or_else(|| panic.downcast_ref::<String>().cloned());
-                let message = message.unwrap_or_else(|| "without a message".into());
-                Err(format!("{} panicked: {message}", planner.name()))
-            }
-        }
+        catch_panics(&planner.name(), drive).map_err(|error| sentence(&*error))
     }
 
     fn build<'p>(
@@ -350,10 +398,9 @@ impl ClosedLoopEvaluation<'_> {
         seed: Seed,
     ) -> Result<Box<dyn Explain + 'p>, BoxError> {
         match planner {
-            RowPlanner::Requested(EvaluatedPlanner::Named(planner)) => {
-                Ok(planner.build(case, self.imagination, seed, self.config)?)
+            RowPlanner::Requested(planner) => {
+                planner.build(case, self.imagination, seed, self.config)
             }
-            RowPlanner::Requested(EvaluatedPlanner::Custom(planner)) => planner.build(case, seed),
             RowPlanner::Proposal {
                 speed_fraction,
                 lateral_offset,
@@ -408,12 +455,14 @@ fn finished(scored: &Scored, milliseconds: f64) -> FinishedDrive {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use std::sync::atomic::{AtomicUsize, Ordering};
 
     use gump_engine::SamplingConfig;
     use gump_model::Device;
     use gump_nuplan::closed_loop::Tracking;
+    use gump_planner::{Candidate, SimpleDriver};
+    use gump_scene::EgoState;
 
     use super::*;
     use crate::recordings::of_boxes;
@@ -436,12 +485,93 @@ mod tests {
         }
     }
 
-    fn named(id: &str) -> Named {
-        let scenario = gump_scene::fixture::scenario(
+    /// What a planner does at a step; `None` is what it usually does.
+    type Fault = fn(&PlannerInput<'_>) -> Result<Option<Trajectory>, BoxError>;
+
+    /// Drives straight on, but in the scenario "b" has a fault at step 3.
+    pub(crate) struct Faulty {
+        name: &'static str,
+        fault: Fault,
+    }
+
+    pub(crate) const PANICS: Faulty = Faulty {
+        name: "panics",
+        fault: |input| panic!("lost at step {}", input.iteration),
+    };
+
+    const LATE: Faulty = Faulty {
+        name: "late",
+        fault: |_| {
+            std::thread::sleep(2 * BUDGET);
+            Ok(None)
+        },
+    };
+
+    pub(crate) const NOT_A_NUMBER: Faulty = Faulty {
+        name: "not-a-number",
+        fault: |input| {
+            let next = EgoState {
+                time_us: input.ego.time_us + 4_000_000,
+                steering_angle: f64::NAN,
+                ..*input.ego
+            };
+            Ok(Some(Trajectory::new(vec![*input.ego, next])?))
+        },
+    };
+
+    /// A limit that no planner exceeds that does not sleep, on a busy machine either.
+    const BUDGET: Duration = Duration::from_millis(600);
+
+    struct FaultyDriver {
+        inner: SimpleDriver,
+        fault: Option<Fault>,
+    }
+
+    impl PlannerFactory for Faulty {
+        fn name(&self) -> String {
+            self.name.into()
+        }
+
+        fn build(&self, case: &Case, _: Seed) -> Result<Box<dyn Explain + '_>, BoxError> {
+            let has_fault = case.recording.scenario().id == "b";
+            Ok(Box::new(FaultyDriver {
+                inner: SimpleDriver::default(),
+                fault: has_fault.then_some(self.fault),
+            }))
+        }
+    }
+
+    impl Driver for FaultyDriver {
+        fn name(&self) -> &str {
+            "faulty"
+        }
+
+        fn start(&mut self, initialization: &PlannerInitialization<'_>) -> Result<(), BoxError> {
+            self.inner.start(initialization)
+        }
+
+        fn drive(&mut self, input: &PlannerInput<'_>) -> Result<Trajectory, BoxError> {
+            let fault = self.fault.filter(|_| input.iteration == 3);
+            match fault.map_or(Ok(None), |fault| fault(input))? {
+                Some(plan) => Ok(plan),
+                None => self.inner.drive(input),
+            }
+        }
+    }
+
+    impl Explain for FaultyDriver {
+        fn candidates(&self) -> Vec<Candidate> {
+            Vec::new()
+        }
+    }
+
+    pub(crate) fn named(id: &str) -> Named {
+        let mut scenario = gump_scene::fixture::scenario(
             "lane 1: -50,0 250,0\nego vehicle 0: 0,0 velocity 8,0\n\
-             agent vehicle 1: 40,0 velocity 8,0\nhistory 1 future 4 dt 0.1",
+             agent vehicle 1: 40,0 velocity 8,0\nhistory 1 future 10 dt 0.1",
         )
         .unwrap();
+        scenario.id = id.into();
         Named {
             id: id.into(),
             log_name: "log".into(),
@@ -450,18 +580,14 @@ mod tests {
         }
     }
 
-    fn check(work: impl FnOnce(&ClosedLoopEvaluation<'_>)) {
+    fn check(planners: &[EvaluatedPlanner<'_>], work: impl FnOnce(&ClosedLoopEvaluation<'_>)) {
         let world = WorldName::Idm;
         let sampling = SamplingConfig::default();
         let loaded = PlanningWorld::load(&Device::Cpu, &world, &sampling).unwrap();
         let worlds = [(world, loaded)];
-        let planners = [
-            EvaluatedPlanner::Named(PlannerName::Simple),
-            EvaluatedPlanner::Custom(&Panics),
-        ];
         let config = PlannerConfig::default();
         work(&ClosedLoopEvaluation {
-            planners: &planners,
+            planners,
             worlds: &worlds,
             imagination: worlds[0].1.imagination(),
             config: &config,
@@ -470,14 +596,102 @@ mod tests {
                 seconds: 3.0,
                 keep_plans: false,
             },
-            budget: None,
+            budget: Some(BUDGET),
             seed: Seed(0),
         });
     }
 
+    const TWO: [EvaluatedPlanner<'_>; 2] = [
+        EvaluatedPlanner::Named(PlannerName::Simple),
+        EvaluatedPlanner::Custom(&Panics),
+    ];
+
+    fn fill(
+        evaluation: &ClosedLoopEvaluation<'_>,
+        shard: &str,
+        ids: &[&str],
+    ) -> Vec<Entry<ScenarioDrives>> {
+        let folder = tempfile::tempdir().unwrap();
+        let header = Header {
+            benchmark: BENCHMARK.into(),
+            shard: shard.parse::<Shard>().unwrap(),
+            settings: toml::Table::new(),
+        };
+        let store = ResultStore::open(folder.path(), &header).unwrap();
+        let cases = ids.iter().map(|id| named(id));
+        evaluation.fill(store, cases, &(), &|_| Ok(())).unwrap()
+    }
+
+    #[test]
+    fn planners_that_fail_in_one_scenario_leave_all_others_alone() {
+        let planners = [
+            PlannerName::Simple.into(),
+            EvaluatedPlanner::Custom(&PANICS),
+            EvaluatedPlanner::Custom(&LATE),
+            EvaluatedPlanner::Custom(&NOT_A_NUMBER),
+        ];
+        check(&planners, |evaluation| {
+            let entries = fill(evaluation, "1/1", &["a", "b", "c"]);
+            let score = |scenario: usize, planner: usize| {
+                let outcome = &entries[scenario].scores.outcomes[planner];
+                outcome.finished.as_ref().map(|finished| finished.score)
+            };
+            let healthy = score(0, 0);
+            assert!(healthy.is_some_and(|score| score > 0.0), "{healthy:?}");
+            for planner in 0..planners.len() {
+                assert_eq!(score(0, planner), healthy, "{planner}");
+                assert_eq!(score(2, planner), healthy, "{planner}");
+            }
+            assert_eq!(score(1, 0), healthy);
+            let errors = entries[1].scores.outcomes.iter();
+            let errors: Vec<&str> = errors.filter_map(|o| o.error.as_deref()).collect();
+            let [panics, late, not_a_number] = errors[..] else {
+                panic!("{errors:?}")
+            };
+            assert_eq!(panics, "panics panicked: lost at step 3");
+            assert!(late.starts_with("iteration 3: faulty: took "), "{late}");
+            assert!(
+                late.ends_with("ms for a plan, expected at most 600.0"),
+                "{late}"
+            );
+            let expected = "iteration 3: faulty: ";
+            assert!(not_a_number.starts_with(expected), "{not_a_number}");
+            assert!(
+                not_a_number.contains("not a finite number"),
+                "{not_a_number}"
+            );
+        });
+    }
+
+    #[test]
+    fn weights_and_scenarios_are_told_apart_by_their_contents() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("w.safetensors");
+        let world = WorldName::Model(path.clone());
+        let sums = |weights: &str, ids: &[&str]| {
+            fs::write(&path, weights).unwrap();
+            let ids: Vec<String> = ids.iter().map(ToString::to_string).collect();
+            checksums(&ids, [&WorldName::Idm, &world, &world]).unwrap()
+        };
+        let first = sums("a", &["1", "2"]);
+        let keys: Vec<&str> = first.keys().map(String::as_str).collect();
+        assert_eq!(keys, [&world.to_string(), "scenario_ids"]);
+        assert_eq!(sums("a", &["1", "2"]), first);
+        let differing = |second: BTreeMap<String, String>| -> Vec<String> {
+            let differs = second.into_iter().filter(|(key, sum)| first[key] != *sum);
+            differs.map(|(key, _)| key).collect()
+        };
+        assert_eq!(differing(sums("b", &["1", "2"])), [world.to_string()]);
+        assert_eq!(differing(sums("a", &["2", "1"])), ["scenario_ids"]);
+        assert_eq!(differing(sums("a", &["12"])), ["scenario_ids"]);
+        fs::remove_file(&path).unwrap();
+        let error = checksums(&[], [&world]).unwrap_err().to_string();
+        assert!(error.contains("w.safetensors"), "{error}");
+    }
+
     #[test]
     fn a_drive_is_scored_and_a_planner_that_panics_has_failed() {
-        check(|evaluation| {
+        check(&TWO, |evaluation| {
             let visited = AtomicUsize::new(0);
             let visit = |drive: VisitedDrive<'_>| {
                 assert_eq!((drive.index, drive.planner), (7, "simple"));
@@ -497,16 +711,8 @@ mod tests {
 
     #[test]
     fn a_store_gets_the_scenarios_of_its_shard_that_it_lacks() {
-        check(|evaluation| {
-            let folder = tempfile::tempdir().unwrap();
-            let header = Header {
-                benchmark: BENCHMARK.into(),
-                shard: "2/2".parse::<Shard>().unwrap(),
-                settings: toml::Table::new(),
-            };
-            let store = ResultStore::open(folder.path(), &header).unwrap();
-            let cases = ["a", "b", "c", "d"].map(named).into_iter();
-            let entries = evaluation.fill(store, cases, &(), &|_| Ok(())).unwrap();
+        check(&TWO, |evaluation| {
+            let entries = fill(evaluation, "2/2", &["a", "b", "c", "d"]);
             let ids: Vec<&str> = entries.iter().map(|entry| entry.id.as_str()).collect();
             assert_eq!(ids, ["b", "d"]);
         });

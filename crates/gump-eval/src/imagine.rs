@@ -10,8 +10,8 @@ use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use gump_rollout::{
-    BoxError, Policy, PredictiveSamples, ProbeConfig, Session, SimulateConfig, Start, WorldModel,
-    simulate,
+    BoxError, Policy, PredictiveSamples, ProbeConfig, Session, SessionStats, SimulateConfig, Start,
+    WorldModel, simulate,
 };
 use gump_scene::{Agent, AgentId, AgentState, Frame, Light, Rollout, Scenario, Seed};
 
@@ -139,12 +139,11 @@ fn simulate_watched(
         simulate(&watched, &[start], driver, config).map_err(EvalError::of_simulation)?;
     let cost = watched.cost.into_inner();
     let cost = cost.unwrap_or_else(PoisonError::into_inner);
-    let passes = world.passes().saturating_sub(cost.passes_before);
     Ok(Imagined {
         rollouts,
         frames: cost.frames,
         elapsed: cost.elapsed,
-        passes_per_frame: passes as f64 / cost.steps.max(1) as f64,
+        passes_per_frame: cost.passes as f64 / cost.steps.max(1) as f64,
         samples: cost.samples,
     })
 }
@@ -163,8 +162,8 @@ struct Cost {
     frames: usize,
     steps: usize,
     elapsed: Duration,
-    /// Passes of the world once its session was open.
-    passes_before: u64,
+    /// Passes of the network since its session was open.
+    passes: u64,
     samples: Vec<PredictiveSamples>,
 }
 
@@ -187,11 +186,9 @@ impl WorldModel for Watched<'_> {
         if self.probe.futures > 0 && !session.probe(self.probe) {
             return Err(EvalError::from(RecordingError::NoPredictiveSamples).into());
         }
-        self.add(|cost| {
-            cost.elapsed += began.elapsed();
-            cost.passes_before = self.world.passes();
-        });
+        self.add(|cost| cost.elapsed += began.elapsed());
         Ok(Box::new(WatchedSession {
+            passes: session.stats().passes,
             session,
             watched: self,
         }))
@@ -201,6 +198,17 @@ impl WorldModel for Watched<'_> {
 struct WatchedSession<'a> {
     session: Box<dyn Session + 'a>,
     watched: &'a Watched<'a>,
+    /// Passes of the session that are counted, or belong to its opening.
+    passes: u64,
+}
+
+impl WatchedSession<'_> {
+    /// Counts the passes made since the last call.
+    fn count_passes(&mut self) {
+        let passes = self.session.stats().passes;
+        self.watched.add(|cost| cost.passes += passes - self.passes);
+        self.passes = passes;
+    }
 }
 
 impl Session for WatchedSession<'_> {
@@ -223,6 +231,7 @@ impl Session for WatchedSession<'_> {
             cost.steps += 1;
             cost.samples.extend(samples);
         });
+        self.count_passes();
         Ok(frames)
     }
 
@@ -242,8 +251,14 @@ impl Session for WatchedSession<'_> {
         self.session.probe(config)
     }
 
+    fn stats(&self) -> SessionStats {
+        self.session.stats()
+    }
+
     fn replace(&mut self, future: usize, start: Start<'_>) -> Result<(), BoxError> {
-        self.session.replace(future, start)
+        self.session.replace(future, start)?;
+        self.count_passes();
+        Ok(())
     }
 }
 

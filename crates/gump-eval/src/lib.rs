@@ -22,8 +22,8 @@
 //! * [`recordings`]: recordings to drive in, from any readable file, including nuPlan's logs.
 //! * [`results`]: results by scenario, in a file from which interrupted runs resume and shards of
 //!   one evaluation are merged; [`shard`]: the assignment of scenarios to shards.
-//! * [`Exclusions`]: scenarios that a benchmark is not defined on; [`rollout_files`]: files of futures
-//!   given by path.
+//! * [`Exclusions`]: scenarios that a benchmark is not defined on; [`Notes`]: what a scene lacks for
+//!   signals and arrivals; [`rollout_files`]: files of futures given by path.
 //!
 //! Metrics, worlds and planners are in their own crates; arguments, progress, tables and charts are
 //! in `xtask`, which follows long work through a [`Monitor`].
@@ -72,4 +72,5 @@ pub use error::{
     SumoError,
 };
 pub use exclusions::Exclusions;
+pub use gump_traffic::{Note, NoteCount, Notes};
 pub use monitor::Monitor;

@@ -44,6 +44,26 @@ pub(crate) fn logs_of(path: &Path) -> Vec<PathBuf> {
 
 /// Every tagged scenario of some logs, read one by one.
 pub(crate) fn open(paths: &[PathBuf]) -> Result<Box<dyn Iterator<Item = Named> + Send>, EvalError> {
+    let (logs, selected) = select(paths)?;
+    let mut maps = Maps::default();
+    Ok(Box::new(selected.into_iter().map(move |selected| Named {
+        id: selected.event.token.to_string(),
+        // The name of a log itself contains dots.
+        log_name: stem(logs[selected.log].path()),
+        scenario_type: selected.scenario_type.clone(),
+        case: case(&logs[selected.log], &selected, &mut maps),
+    })))
+}
+
+/// The ids of [`open`], without the scenarios.
+pub(crate) fn ids(paths: &[PathBuf]) -> Result<Vec<String>, EvalError> {
+    let (_, selected) = select(paths)?;
+    let ids = selected.iter().map(|selected| selected.event.token);
+    Ok(ids.map(|token| token.to_string()).collect())
+}
+
+/// Some logs and their tagged scenarios.
+fn select(paths: &[PathBuf]) -> Result<(Vec<Log>, Vec<Selected>), EvalError> {
     let logs: Vec<Log> = paths
         .iter()
         .map(|path| Log::open(path))
@@ -53,14 +73,7 @@ pub(crate) fn open(paths: &[PathBuf]) -> Result<Box<dyn Iterator<Item = Named> +
         let logs = paths.to_vec();
         return Err(RecordingError::NoTaggedScenarios { logs }.into());
     }
-    let mut maps = Maps::default();
-    Ok(Box::new(selected.into_iter().map(move |selected| Named {
-        id: selected.event.token.to_string(),
-        // The name of a log itself contains dots.
-        log_name: stem(logs[selected.log].path()),
-        scenario_type: selected.scenario_type.clone(),
-        case: case(&logs[selected.log], &selected, &mut maps),
-    })))
+    Ok((logs, selected))
 }
 
 fn stem(path: &Path) -> String {

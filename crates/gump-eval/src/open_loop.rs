@@ -1,6 +1,7 @@
 //! Open-loop planning: plans along a log against what was driven, with nuPlan's scores.
 //!
-//! [`plan`] lets a planner plan along recordings; one comparison is
+//! [`plan`] lets a planner plan along recordings, one of ours by name or any
+//! [`PlannerFactory`](crate::closed_loop::PlannerFactory); one comparison is
 //! [`gump_planner::closed_loop::plan_and_compare`].
 
 use gump_nuplan::closed_loop::Replayed;
@@ -9,7 +10,8 @@ use gump_planner::closed_loop::{evaluate, plan_and_compare};
 use gump_rollout::WorldModel;
 use gump_scene::Seed;
 
-use crate::planners::{PlannerConfig, PlannerName};
+use crate::closed_loop::EvaluatedPlanner;
+use crate::planners::{PlannerConfig, catch_panics};
 use crate::recordings::{Case, Named};
 use crate::{EvalError, Monitor};
 
@@ -29,30 +31,42 @@ pub struct OpenLoopOutcome {
 /// position. The monitor counts recordings.
 ///
 /// # Errors
-/// [`EvalError::Stopped`]. A failed comparison is an outcome.
-pub fn plan(
+/// [`EvalError::Stopped`]. A failed comparison is an outcome, that of a planner that panics as well.
+pub fn plan<'a>(
     cases: impl Iterator<Item = Named> + Send,
-    planner: PlannerName,
-    imagination: &dyn WorldModel,
+    planner: impl Into<EvaluatedPlanner<'a>>,
+    imagination: &'a dyn WorldModel,
     config: &PlannerConfig,
     seed: Seed,
     monitor: &dyn Monitor,
 ) -> Result<Vec<OpenLoopOutcome>, EvalError> {
-    let outcomes = evaluate(cases, |i, named: Named| {
+    let planner = planner.into();
+    let name = planner.name();
+    let compare = |i: usize, named: Named| {
         let compared = named.case.and_then(|case| {
-            let mut driver = planner.build(&case, imagination, seed.fork(i as u64), config)?;
-            let (recording, after) = (&case.recording, &case.after);
-            let seconds = comparable_seconds(&case);
-            let compared =
-                plan_and_compare(recording, after, &mut Replayed, &mut *driver, seconds)?;
-            Ok(compared)
+            let compared = catch_panics(&name, || {
+                let mut driver = planner.build(&case, imagination, seed.fork(i as u64), config)?;
+                let (recording, after) = (&case.recording, &case.after);
+                let seconds = comparable_seconds(&case);
+                let compared =
+                    plan_and_compare(recording, after, &mut Replayed, &mut *driver, seconds);
+                Ok(compared.map_err(EvalError::from)?)
+            });
+            compared.map_err(EvalError::of_simulation)
         });
         monitor.advance(1);
         OpenLoopOutcome {
             id: named.id,
             compared,
         }
-    });
+    };
+    let outcomes = match planner.is_parallel() {
+        true => evaluate(cases, compare),
+        false => cases
+            .enumerate()
+            .map(|(i, named)| compare(i, named))
+            .collect(),
+    };
     monitor.check()?;
     Ok(outcomes)
 }
@@ -85,6 +99,8 @@ mod tests {
 
     use super::*;
     use crate::RecordingError;
+    use crate::closed_loop::tests::{NOT_A_NUMBER, PANICS, named};
+    use crate::planners::PlannerName;
     use crate::recordings::of_boxes;
 
     #[test]
@@ -110,5 +126,26 @@ mod tests {
         assert!(numbers[0].1 > 0.9 && numbers[1].1 < 0.1, "{numbers:?}");
         assert_eq!((&*outcomes[0].id, &*outcomes[1].id), ("a", "b"));
         assert!(outcomes[1].compared.is_err());
+    }
+
+    #[test]
+    fn planners_that_fail_in_one_scenario_go_on_in_the_others() {
+        let world = Idm::default();
+        let config = PlannerConfig::default();
+        for (planner, reason) in [
+            (&PANICS, "panics panicked: lost at step 3"),
+            (&NOT_A_NUMBER, "not a finite number"),
+        ] {
+            let cases = ["a", "b", "c"].map(named).into_iter();
+            let planner = EvaluatedPlanner::Custom(planner);
+            let outcomes = plan(cases, planner, &world, &config, Seed(0), &()).unwrap();
+            let [first, failed, last] = &outcomes[..] else {
+                panic!("{} outcomes", outcomes.len())
+            };
+            assert!(first.compared.is_ok() && last.compared.is_ok());
+            assert_eq!(failed.id, "b");
+            let error = failed.compared.as_ref().err().unwrap().sentence();
+            assert!(error.contains(reason), "{error}");
+        }
     }
 }

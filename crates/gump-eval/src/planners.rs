@@ -5,13 +5,14 @@
 )]
 
 use std::fmt;
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::str::FromStr;
 use std::time::{Duration, Instant};
 
 use gump_engine::{CacheMode, SamplingConfig};
 use gump_model::Device;
 use gump_nuplan::closed_loop::{
-    Driver, Imagined, PlannerInitialization, PlannerInput, Replayed, Traffic,
+    Driver, ImaginedTraffic, PlannerInitialization, PlannerInput, Replayed, Traffic,
 };
 use gump_nuplan::reactive_agents::NuplanIdm;
 use gump_nuplan::tracking::Trajectory;
@@ -231,6 +232,23 @@ impl PlannerConfig {
     }
 }
 
+/// The result of a planner's work. A planner that panics has failed like any other, so that the
+/// others and the other scenarios go on.
+pub(crate) fn catch_panics<T>(
+    planner: &str,
+    work: impl FnOnce() -> Result<T, BoxError>,
+) -> Result<T, BoxError> {
+    // Whatever the planner left half done is dropped with it.
+    catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|panic| {
+        let message = panic
+            .downcast_ref::<&str>()
+            .copied()
+            .or_else(|| panic.downcast_ref::<String>().map(String::as_str));
+        let message = message.unwrap_or("without a message");
+        Err(format!("{planner} panicked: {message}").into())
+    })
+}
+
 /// The traffic of a drive and the world that planners roll out, by the world's name.
 pub struct PlanningWorld {
     name: WorldName,
@@ -289,8 +307,11 @@ impl PlanningWorld {
         match (&self.name, &self.learned) {
             (WorldName::Log, _) => Box::new(Replayed),
             (WorldName::Idm, _) => Box::new(NuplanIdm::default()),
-            (_, Some(world)) => Box::new(Imagined::new(world.model(), seed)),
-            (_, None) => Box::new(Imagined::new(&gump_rollout::worlds::ConstantVelocity, seed)),
+            (_, Some(world)) => Box::new(ImaginedTraffic::new(world.model(), seed)),
+            (_, None) => Box::new(ImaginedTraffic::new(
+                &gump_rollout::worlds::ConstantVelocity,
+                seed,
+            )),
         }
     }
 }

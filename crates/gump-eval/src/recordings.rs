@@ -76,6 +76,40 @@ pub fn open_all(
     Ok(Box::new(open(first)?.chain(others)))
 }
 
+/// The ids of the first `limit` scenarios of some files or folders, in the order of [`open_all`] and
+/// without what driving needs. A scenario that cannot be read is named by its position.
+///
+/// Error: the first path contains nothing to read.
+pub fn ids(paths: &[PathBuf], limit: usize) -> Result<Vec<String>, EvalError> {
+    let mut ids = Vec::new();
+    for (n, path) in paths.iter().enumerate() {
+        if ids.len() >= limit {
+            break;
+        }
+        match ids_of_path(path, limit - ids.len()) {
+            Ok(found) => ids.extend(found),
+            Err(error) if n == 0 => return Err(error),
+            Err(_) => ids.push(format!("#{}", ids.len())),
+        }
+    }
+    Ok(ids)
+}
+
+fn ids_of_path(path: &Path, limit: usize) -> Result<Vec<String>, EvalError> {
+    let logs = nuplan_recordings::logs_of(path);
+    if !logs.is_empty() {
+        let mut ids = nuplan_recordings::ids(&logs)?;
+        ids.truncate(limit);
+        return Ok(ids);
+    }
+    let records = gump_data::open(path)?.take(limit).enumerate();
+    let ids = records.map(|(i, record)| match record {
+        Ok(record) => record.scenario.id,
+        Err(_) => format!("#{i}"),
+    });
+    Ok(ids.collect())
+}
+
 /// A file name without its extensions.
 pub fn log_name(path: &Path) -> String {
     let name = path.file_name().unwrap_or_default().to_string_lossy();

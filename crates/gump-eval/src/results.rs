@@ -23,6 +23,11 @@ const NAME: &str = "scenarios.toml";
 /// Header of the table of a scenario.
 const ENTRY: &str = "[[scenario]]";
 
+/// Key of [`Header::settings`] for the checksums of what an evaluation reads: the ids of the
+/// scenarios, files of weights. Their names do not tell whether two machines read the same.
+/// Ledgers of version 0.1 have no checksums, so only those count that two headers have both.
+pub const CHECKSUMS: &str = "checksums";
+
 /// Identifies the evaluation; the first table of the file.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Header {
@@ -30,8 +35,37 @@ pub struct Header {
     pub benchmark: String,
     /// The shard of the scenarios.
     pub shard: Shard,
-    /// Everything that the entries depend on; the same for all shards of one evaluation.
+    /// Everything that the entries depend on; the same for all shards of one evaluation, with
+    /// [`CHECKSUMS`] of what was read.
     pub settings: toml::Table,
+}
+
+impl Header {
+    /// Whether the settings are the same, whatever was read.
+    fn has_settings_of(&self, other: &Self) -> bool {
+        let settings = |header: &Self| {
+            let all = header.settings.clone().into_iter();
+            all.filter(|(key, _)| key != CHECKSUMS)
+                .collect::<toml::Table>()
+        };
+        self.benchmark == other.benchmark
+            && self.shard.n == other.shard.n
+            && settings(self) == settings(other)
+    }
+
+    /// Checksums by what they are of.
+    fn checksums(&self) -> impl Iterator<Item = (&str, &str)> {
+        let stored = self.settings.get(CHECKSUMS).and_then(toml::Value::as_table);
+        let stored = stored.into_iter().flatten();
+        stored.filter_map(|(input, checksum)| Some((input.as_str(), checksum.as_str()?)))
+    }
+
+    /// Whether nothing that both have a checksum of differs.
+    fn has_inputs_of(&self, other: &Self) -> bool {
+        let others: BTreeMap<&str, &str> = other.checksums().collect();
+        let mut own = self.checksums();
+        own.all(|(input, checksum)| others.get(input).is_none_or(|found| *found == checksum))
+    }
 }
 
 /// The result of one scenario.
@@ -65,8 +99,13 @@ pub struct ResultStore<T> {
 impl<T: Serialize + DeserializeOwned + Clone> ResultStore<T> {
     /// Opens the store of a folder: resumes an interrupted run of the same evaluation, or starts a
     /// new one.
+    ///
+    /// # Errors
+    /// [`ResultsError::OtherShard`] in a folder with another shard of the same evaluation, whose
+    /// results would be lost, and errors of writing.
     pub fn open(folder: &Path, header: &Header) -> Result<Self, EvalError> {
         let path = partial(folder);
+        refuse_other_shard(folder, header)?;
         let kept: Vec<Entry<T>> = match fs::read_to_string(&path) {
             Ok(text) => resumable(&text, header),
             Err(_) => Vec::new(),
@@ -173,12 +212,38 @@ fn partial(folder: &Path) -> PathBuf {
     folder.join(format!("{NAME}.partial"))
 }
 
+/// Error: the folder has another shard of the evaluation, finished or not.
+fn refuse_other_shard(folder: &Path, header: &Header) -> Result<(), EvalError> {
+    for path in [partial(folder), folder.join(NAME)] {
+        let Ok(text) = fs::read_to_string(&path) else {
+            continue;
+        };
+        let start = &text[..text.find(ENTRY).unwrap_or(text.len())];
+        let Ok(Document::<toml::Table> { evaluation, .. }) = toml::from_str(start) else {
+            continue;
+        };
+        let stored = evaluation.filter(|stored| stored.has_settings_of(header));
+        if let Some(stored) = stored.filter(|stored| stored.shard != header.shard) {
+            return Err(ResultsError::OtherShard {
+                path,
+                stored: stored.shard,
+                requested: header.shard,
+            }
+            .into());
+        }
+    }
+    Ok(())
+}
+
 /// The entries of an interrupted run, if it was of the same evaluation; without the last one, which
 /// may be truncated.
 fn resumable<T: DeserializeOwned>(text: &str, header: &Header) -> Vec<Entry<T>> {
     let whole = &text[..text.rfind(ENTRY).unwrap_or(0)];
+    let is_same = |found: &Header| {
+        found.shard == header.shard && found.has_settings_of(header) && found.has_inputs_of(header)
+    };
     match toml::from_str::<Document<Entry<T>>>(whole) {
-        Ok(found) if found.evaluation.as_ref() == Some(header) => found.scenario,
+        Ok(found) if found.evaluation.as_ref().is_some_and(is_same) => found.scenario,
         _ => Vec::new(),
     }
 }
@@ -203,7 +268,8 @@ pub enum MissingShards {
 
 /// Entries of the shards of one evaluation in order of the scenarios, and the header without shard.
 ///
-/// Error: shards given twice or of different evaluations, and missing ones unless they are allowed.
+/// Error: shards given twice, of different evaluations or of different inputs, scenarios that are
+/// there twice or not of their shard, and missing shards unless they are allowed.
 pub fn merge<T: DeserializeOwned>(
     folders: &[PathBuf],
     when_missing: MissingShards,
@@ -211,10 +277,12 @@ pub fn merge<T: DeserializeOwned>(
     let mut shards: BTreeMap<usize, &Path> = BTreeMap::new();
     let mut first: Option<(Header, &Path)> = None;
     let mut entries = BTreeMap::new();
+    let mut inputs = BTreeMap::new();
     for folder in folders {
         let (header, scenarios) = parse::<Entry<T>>(&text(folder)?, folder)?;
         let (expected, example) = first.get_or_insert_with(|| (header.clone(), folder));
         check_same(expected, example, &header, folder)?;
+        check_inputs(&mut inputs, &header, folder)?;
         if let Some(other) = shards.insert(header.shard.k, folder) {
             return Err(ResultsError::RepeatedShard {
                 shard: header.shard,
@@ -233,7 +301,11 @@ pub fn merge<T: DeserializeOwned>(
                 }
                 .into());
             }
-            entries.insert(entry.index, entry);
+            let index = entry.index;
+            if entries.insert(index, entry).is_some() {
+                let folder = folder.clone();
+                return Err(ResultsError::RepeatedScenario { index, folder }.into());
+            }
         }
     }
     let (header, _) = first.ok_or(ResultsError::NoFolders)?;
@@ -252,10 +324,7 @@ fn check_same(
     found: &Header,
     folder: &Path,
 ) -> Result<(), EvalError> {
-    let same = expected.benchmark == found.benchmark
-        && expected.settings == found.settings
-        && expected.shard.n == found.shard.n;
-    if same {
+    if expected.has_settings_of(found) {
         return Ok(());
     }
     Err(ResultsError::DifferentEvaluations {
@@ -265,6 +334,30 @@ fn check_same(
         found_in: folder.to_owned(),
     }
     .into())
+}
+
+/// Compares the checksums of a shard with those of the shards before it, of which `known` has each
+/// with the first folder that stores it.
+fn check_inputs<'a>(
+    known: &mut BTreeMap<String, (String, &'a Path)>,
+    header: &Header,
+    folder: &'a Path,
+) -> Result<(), EvalError> {
+    for (input, checksum) in header.checksums() {
+        let first = known.entry(input.to_owned());
+        let (expected, expected_in) = first.or_insert_with(|| (checksum.to_owned(), folder));
+        if expected != checksum {
+            return Err(ResultsError::DifferentInputs {
+                input: input.to_owned(),
+                expected: expected.clone(),
+                expected_in: expected_in.to_owned(),
+                found: checksum.to_owned(),
+                found_in: folder.to_owned(),
+            }
+            .into());
+        }
+    }
+    Ok(())
 }
 
 fn text(folder: &Path) -> Result<String, EvalError> {
@@ -351,8 +444,98 @@ mod tests {
             [0, 2, 4, 6, 8]
         );
         fails(&["1of2", "also 1of2"], "every shard once, found 1/2");
-        fails(&["1of2", "1of3"], "one evaluation");
+        fails(&["1of2", "1of3"], "one evaluation, but ");
+        fails(&["1of2", "1of3"], " differ: number of shards 2 and 3");
         fails(&["nowhere"], "cannot read");
+        let edit = |name: &str, from: &str, to: &str| {
+            let path = place("1of2").join(NAME);
+            let text = fs::read_to_string(path).unwrap();
+            assert_eq!(text.matches(from).count(), 1, "{from}");
+            fs::create_dir_all(place(name)).unwrap();
+            fs::write(place(name).join(NAME), text.replace(from, to)).unwrap();
+        };
+        edit("foreign", "index = 4\n", "index = 5\n");
+        fails(&["foreign"], "scenario 5 is not of shard 1/2");
+        edit("doubled", "index = 4\n", "index = 2\n");
+        fails(&["doubled"], "found scenario 2 twice in");
+    }
+
+    /// The header of a shard that read weights with this checksum; none as of version 0.1.
+    fn header_with(k: usize, n: usize, checksum: Option<&str>) -> Header {
+        let mut header = header(k, n);
+        if let Some(checksum) = checksum {
+            let checksums = toml::Table::from_iter([("weights".into(), checksum.into())]);
+            header.settings.insert(CHECKSUMS.into(), checksums.into());
+        }
+        header
+    }
+
+    #[test]
+    fn shards_of_other_weights_under_the_same_name_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let place = |name: &str| folder.path().join(name);
+        let write = |name: &str, k: usize, checksum: Option<&str>| {
+            fs::create_dir_all(place(name)).unwrap();
+            let header = header_with(k, 3, checksum);
+            let mut store = ResultStore::open(&place(name), &header).unwrap();
+            store.add(entry(k - 1, 0.5)).unwrap();
+            store.close().unwrap();
+        };
+        write("old", 1, None);
+        write("a2", 2, Some("aa"));
+        write("a3", 3, Some("aa"));
+        write("b3", 3, Some("bb"));
+        let merged = |names: [&str; 3]| {
+            let merged = merge::<f64>(&names.map(place), MissingShards::Refuse);
+            merged.map(|(_, entries)| entries.len())
+        };
+        // Results without checksums go with any, and do not hide that others differ.
+        assert_eq!(merged(["old", "a2", "a3"]).unwrap(), 3);
+        assert_eq!(merged(["a3", "a2", "old"]).unwrap(), 3);
+        for names in [["old", "a2", "b3"], ["b3", "old", "a2"]] {
+            let error = merged(names).unwrap_err().to_string();
+            let parts = ["found weights of checksum", "aa in", "bb in"];
+            assert!(parts.iter().all(|part| error.contains(part)), "{error}");
+        }
+    }
+
+    #[test]
+    fn a_run_resumes_with_the_weights_that_it_began_with() {
+        let n_kept = |before: Option<&str>, now: Option<&str>| {
+            let folder = tempfile::tempdir().unwrap();
+            let mut store = ResultStore::open(folder.path(), &header_with(1, 1, before)).unwrap();
+            store.add(entry(0, 0.5)).unwrap();
+            store.add(entry(1, 0.5)).unwrap();
+            drop(store);
+            let resumed = ResultStore::<f64>::open(folder.path(), &header_with(1, 1, now));
+            resumed.unwrap().indices().len()
+        };
+        // The last entry may be truncated, so it does not count.
+        assert_eq!(n_kept(Some("aa"), Some("aa")), 1);
+        assert_eq!(n_kept(None, Some("aa")), 1);
+        assert_eq!(n_kept(Some("bb"), Some("aa")), 0);
+    }
+
+    #[test]
+    fn a_shard_does_not_replace_another_one_of_its_evaluation() {
+        let folder = tempfile::tempdir().unwrap();
+        let open = |k, n| ResultStore::<f64>::open(folder.path(), &header(k, n));
+        let refused = |k, n| {
+            let error = open(k, n).err().unwrap().to_string();
+            let expected = "expected a folder for shard 2/3 alone, found shard 1/3";
+            assert!(error.starts_with(expected), "{error}");
+        };
+        let mut store = open(1, 3).unwrap();
+        refused(2, 3);
+        store.add(entry(0, 0.5)).unwrap();
+        store.close().unwrap();
+        refused(2, 3);
+        let (_, entries) = merge::<f64>(&[folder.path().to_owned()], MissingShards::Allow).unwrap();
+        assert_eq!(entries.len(), 1);
+        // The same shard again and another split of the scenarios begin anew.
+        open(1, 3).unwrap();
+        fs::remove_file(partial(folder.path())).unwrap();
+        open(1, 2).unwrap();
     }
 
     #[test]

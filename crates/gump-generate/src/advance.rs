@@ -37,7 +37,7 @@ pub(crate) fn advance(
         return Ok(false);
     }
     let asking: Vec<bool> = open.iter().map(|partial| partial.asks()).collect();
-    let hidden = read(world, engine, &mut open, |i| asking[i].then_some(None))?;
+    let hidden = read(engine, &mut open, |i| asking[i].then_some(None))?;
     let mut successors = engine.successors(&hidden).into_iter();
     let mut keys = Vec::with_capacity(open.len());
     for (partial, asks) in open.iter_mut().zip(&asking) {
@@ -48,7 +48,7 @@ pub(crate) fn advance(
         }
         keys.push(key);
     }
-    let hidden = read(world, engine, &mut open, |i| keys[i].map(Some))?;
+    let hidden = read(engine, &mut open, |i| keys[i].map(Some))?;
     let width = world.network().config().width;
     let mut rows = hidden.chunks_exact(width);
     let placed = open.into_iter().zip(keys).filter_map(|(partial, key)| {
@@ -78,7 +78,6 @@ fn rows_next<'h>(
 /// Hidden vectors at the last slot of every scene for which `last` returns it: the key of a further
 /// agent, or the last value.
 fn read(
-    world: &TransformerWorld,
     engine: &Engine,
     open: &mut [&mut PartialScene<'_>],
     last: impl Fn(usize) -> Option<Option<Key>>,
@@ -102,9 +101,6 @@ fn read(
             })
         })
         .collect();
-    if !jobs.is_empty() {
-        world.count_passes(1);
-    }
     Ok(engine.run(&mut jobs))
 }
 

@@ -17,6 +17,7 @@
 use std::collections::BTreeSet;
 
 use gump_engine::placement::object_spec::{Bounds, Class, ObjectSpec, Relation};
+use gump_scene::{AgentKind, LaneId};
 use gump_tokenizer::Field;
 use serde::Deserialize;
 
@@ -34,6 +35,112 @@ struct File {
     object: Vec<ObjectSpec>,
 }
 
+/// Why constraints cannot be met.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum ConstraintError {
+    /// The text is not of the form.
+    #[error("line {line}: {reason}")]
+    Text {
+        /// Number of the line, from 1.
+        line: usize,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// Two objects have the same id.
+    #[error("the id \"{id}\" occurs twice")]
+    RepeatedId {
+        /// The id.
+        id: String,
+    },
+    /// The ego is of another class.
+    #[error("the ego is a vehicle")]
+    EgoClass,
+    /// The ego is given a place.
+    #[error("the ego is the origin: it has no x, y, heading or lane")]
+    EgoPlace,
+    /// A relation names an object that does not exist.
+    #[error("\"{id}\" refers to \"{other}\", which is no object")]
+    NoSuchObject {
+        /// The object with the relation.
+        id: String,
+        /// The name.
+        other: String,
+    },
+    /// An object is related to itself.
+    #[error("\"{id}\" cannot be in a row with itself")]
+    OwnRow {
+        /// The object.
+        id: String,
+    },
+    /// The gap of a relation is out of its range.
+    #[error("the gap of \"{id}\" is {metres} m, expected 0 to 150")]
+    Gap {
+        /// The object with the relation.
+        id: String,
+        /// The gap, metres.
+        metres: f64,
+    },
+    /// The bounds of a number are out of their range, or not in order.
+    #[error(
+        "{key} of \"{id}\" goes from {from} to {to}, expected ascending numbers from {low:.1} to \
+         {high:.1}"
+    )]
+    Range {
+        /// The key.
+        key: &'static str,
+        /// The object.
+        id: String,
+        /// The lower bound given.
+        from: f64,
+        /// The upper bound given.
+        to: f64,
+        /// The least it may be.
+        low: f64,
+        /// The most it may be.
+        high: f64,
+    },
+    /// Objects would have to follow each other in a circle.
+    #[error("\"{id}\" would have to be both ahead of and behind others in one row")]
+    Circle {
+        /// One of them.
+        id: String,
+    },
+    /// More objects of a class are described than requested.
+    #[error("{described} objects of class {} are described but {requested} asked for", kind.name())]
+    TooManyDescribed {
+        /// The class.
+        kind: AgentKind,
+        /// Number described.
+        described: usize,
+        /// Number requested.
+        requested: usize,
+    },
+    /// No point satisfies the constraints of an object.
+    #[error(
+        "{} fits the x, y and heading of \"{id}\"",
+        lane.map_or("no lane".into(), |lane| format!("no point of lane {lane}"))
+    )]
+    NoPoint {
+        /// The object.
+        id: String,
+        /// The lane that it must be in.
+        lane: Option<i64>,
+    },
+    /// A lane does not exist.
+    #[error("the map has no lane {lane}")]
+    NoSuchLane {
+        /// Its id.
+        lane: LaneId,
+    },
+    /// A lane is too far from the ego.
+    #[error("lane {lane} does not come within 100 m of the ego")]
+    LaneTooFar {
+        /// Its id.
+        lane: LaneId,
+    },
+}
+
 /// Reads the objects of a TOML file.
 ///
 /// # Errors
@@ -43,8 +150,8 @@ pub fn parse_constraints(text: &str) -> Result<Vec<ObjectSpec>, GenerateError> {
         let line = error
             .span()
             .map_or(1, |span| text[..span.start].matches('\n').count() + 1);
-        let what = error.message().trim().replace('\n', " ");
-        GenerateError::Constraints(format!("line {line}: {what}"))
+        let reason = error.message().trim().replace('\n', " ");
+        ConstraintError::Text { line, reason }
     })?;
     check(&file.object)?;
     Ok(file.object)
@@ -55,40 +162,41 @@ pub fn parse_constraints(text: &str) -> Result<Vec<ObjectSpec>, GenerateError> {
 /// # Errors
 /// [`GenerateError::Constraints`] with the first contradiction.
 pub(crate) fn check(objects: &[ObjectSpec]) -> Result<(), GenerateError> {
-    let fail = |what: String| Err(GenerateError::Constraints(what));
+    let fail = |error: ConstraintError| Err(error.into());
     let mut ids = BTreeSet::new();
     for object in objects {
         if !ids.insert(object.id.as_str()) {
-            return fail(format!("the id \"{}\" occurs twice", object.id));
+            let id = object.id.clone();
+            return fail(ConstraintError::RepeatedId { id });
         }
     }
     ids.insert(EGO);
     for object in objects {
         let id = &object.id;
         if id == EGO && object.class != Class::Vehicle {
-            return fail("the ego is a vehicle".into());
+            return fail(ConstraintError::EgoClass);
         }
         if id == EGO
             && (object.x.or(object.y).or(object.heading).is_some() || object.lane.is_some())
         {
-            return fail("the ego is the origin: it has no x, y, heading or lane".into());
+            return fail(ConstraintError::EgoPlace);
         }
         check_numbers(object)?;
         for relation in [&object.behind, &object.ahead_of].into_iter().flatten() {
             if !ids.contains(relation.object.as_str()) {
-                let other = &relation.object;
-                return fail(format!(
-                    "\"{id}\" refers to \"{other}\", which is no object"
-                ));
+                return fail(ConstraintError::NoSuchObject {
+                    id: id.clone(),
+                    other: relation.object.clone(),
+                });
             }
             if relation.object == *id {
-                return fail(format!("\"{id}\" cannot be in a row with itself"));
+                return fail(ConstraintError::OwnRow { id: id.clone() });
             }
             if !(relation.metres.is_finite() && (0.0..=150.0).contains(&relation.metres)) {
-                let found = relation.metres;
-                return fail(format!(
-                    "the gap of \"{id}\" is {found} m, expected 0 to 150"
-                ));
+                return fail(ConstraintError::Gap {
+                    id: id.clone(),
+                    metres: relation.metres,
+                });
             }
         }
     }
@@ -98,7 +206,7 @@ pub(crate) fn check(objects: &[ObjectSpec]) -> Result<(), GenerateError> {
 fn check_numbers(object: &ObjectSpec) -> Result<(), GenerateError> {
     let (x, length, width) = (Field::X.high(), Field::Length.high(), Field::Width.high());
     let turn = std::f64::consts::TAU;
-    for (name, given, low, high) in [
+    for (key, given, low, high) in [
         ("x", object.x, -x, x),
         ("y", object.y, -x, x),
         ("heading", object.heading, -turn, turn),
@@ -115,11 +223,16 @@ fn check_numbers(object: &ObjectSpec) -> Result<(), GenerateError> {
         };
         let in_range = from <= to && low <= from && to <= high;
         if !in_range {
-            let id = &object.id;
-            return Err(GenerateError::Constraints(format!(
-                "{name} of \"{id}\" goes from {from} to {to}, \
-                 expected ascending numbers from {low:.1} to {high:.1}"
-            )));
+            let id = object.id.clone();
+            let error = ConstraintError::Range {
+                key,
+                id,
+                from,
+                to,
+                low,
+                high,
+            };
+            return Err(error.into());
         }
     }
     Ok(())
@@ -143,9 +256,8 @@ fn check_rows(objects: &[ObjectSpec]) -> Result<(), GenerateError> {
             let more = pairs.iter().filter(|(f, _)| reached.contains(f));
             let more: Vec<&str> = more.map(|(_, back)| *back).collect();
             if more.contains(&front) {
-                return Err(GenerateError::Constraints(format!(
-                    "\"{front}\" would have to be both ahead of and behind others in one row"
-                )));
+                let id = front.to_owned();
+                return Err(ConstraintError::Circle { id }.into());
             }
             let before = reached.len();
             reached.extend(more);

@@ -259,7 +259,7 @@ impl<'a> SiteSampler<'a> {
         }
         let site = site.or_else(here).ok_or_else(|| {
             let names: Vec<&str> = request.prompts.iter().map(|tag| tag.name()).collect();
-            GenerateError::NoStage {
+            GenerateError::NoSite {
                 prompts: names.join(" and "),
             }
         })?;

@@ -5,9 +5,9 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use gump_engine::cpu::SceneMemory;
-use gump_engine::placement::ground::Ground;
 use gump_engine::placement::object_spec::{ObjectSpec, agent_of};
 use gump_engine::placement::rules::{Manner, Rules};
+use gump_engine::placement::spawn_map::SpawnMap;
 use gump_engine::scene::SceneContext;
 use gump_engine::{EngineError, SamplingConfig, TransformerWorld};
 use gump_geometry::OrientedBox;
@@ -17,6 +17,7 @@ use gump_tokenizer::{
     AGENT_KEYS, Identities, Key, QuantizedState, TokenAgent, TokenFrame, TokenSequence,
 };
 
+use crate::constraint::ConstraintError;
 use crate::constraint::EGO;
 use crate::{GenerateError, GenerateRequest, Placement, constraint};
 
@@ -27,8 +28,8 @@ pub(crate) struct Prepared<'a> {
     prompts: Vec<Option<ScenarioTag>>,
     /// With relations stored on both sides.
     pub(super) objects: Vec<ObjectSpec>,
-    grounds: BTreeMap<AgentKind, Arc<Ground>>,
-    lanes: BTreeMap<i64, Arc<Ground>>,
+    grounds: BTreeMap<AgentKind, Arc<SpawnMap>>,
+    lanes: BTreeMap<i64, Arc<SpawnMap>>,
     /// Boxes of static objects, scene frame.
     pub(super) fixtures: Vec<OrientedBox>,
     pub(super) sampling: SamplingConfig,
@@ -45,7 +46,7 @@ impl<'a> Prepared<'a> {
         constraint::mutual(&mut objects);
         let pose = request.ego.pose;
         let of_class = |kind| {
-            let ground = Ground::of_class(&request.map, pose, kind);
+            let ground = SpawnMap::of_class(&request.map, pose, kind);
             (kind, Arc::new(ground))
         };
         let grounds: BTreeMap<_, _> = AgentKind::MOVING.into_iter().map(of_class).collect();
@@ -111,12 +112,14 @@ impl<'a> Prepared<'a> {
             }
             Some(counts) => {
                 for kind in AgentKind::MOVING {
-                    let (named, asked) = (wished(kind).count(), counts.of(kind));
-                    if named > asked {
-                        return Err(GenerateError::Constraints(format!(
-                            "{named} objects of class {} are described but {asked} asked for",
-                            kind.name()
-                        )));
+                    let (described, requested) = (wished(kind).count(), counts.of(kind));
+                    if described > requested {
+                        let error = ConstraintError::TooManyDescribed {
+                            kind,
+                            described,
+                            requested,
+                        };
+                        return Err(error.into());
                     }
                 }
                 counts.total()
@@ -137,13 +140,11 @@ impl<'a> Prepared<'a> {
             let rules = self.rules(object.class.kind(), object, &[], &BTreeMap::new());
             let in_row = object.behind.is_some() || object.ahead_of.is_some();
             if !in_row && !rules.has_place() {
-                let whereabouts = object.lane.map_or("no lane".to_owned(), |lane| {
-                    format!("no point of lane {lane}")
-                });
-                return Err(GenerateError::Constraints(format!(
-                    "{whereabouts} fits the x, y and heading of \"{}\"",
-                    object.id
-                )));
+                let error = ConstraintError::NoPoint {
+                    id: object.id.clone(),
+                    lane: object.lane,
+                };
+                return Err(error.into());
             }
         }
         Ok(())
@@ -243,14 +244,13 @@ fn scene_of_ego(
 }
 
 /// Valid positions on every lane that constraints name.
-fn lane_grounds(request: &GenerateRequest) -> Result<BTreeMap<i64, Arc<Ground>>, GenerateError> {
+fn lane_grounds(request: &GenerateRequest) -> Result<BTreeMap<i64, Arc<SpawnMap>>, GenerateError> {
     let lanes = request.objects.iter().filter_map(ObjectSpec::lane);
     let ground = |lane: LaneId| {
-        let ground = Ground::of_lane(&request.map, request.ego.pose, lane)
-            .ok_or_else(|| GenerateError::Constraints(format!("the map has no lane {lane}")))?;
+        let ground = SpawnMap::of_lane(&request.map, request.ego.pose, lane)
+            .ok_or(ConstraintError::NoSuchLane { lane })?;
         if ground.is_closed() {
-            let what = format!("lane {lane} does not come within 100 m of the ego");
-            return Err(GenerateError::Constraints(what));
+            return Err(ConstraintError::LaneTooFar { lane }.into());
         }
         Ok((lane.0, Arc::new(ground)))
     };

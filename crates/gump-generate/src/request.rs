@@ -15,6 +15,7 @@ use serde::de::value::Error as NameError;
 use serde::{Deserialize, Serialize};
 
 use crate::advance;
+use crate::constraint::ConstraintError;
 use crate::partial_scene::PartialScene;
 use crate::prepared::Prepared;
 
@@ -262,7 +263,7 @@ impl GeneratedScene {
 pub enum GenerateError {
     /// Constraints that contradict themselves, each other or the map.
     #[error("constraints: {0}")]
-    Constraints(String),
+    Constraints(#[from] ConstraintError),
     /// The map has no lane for vehicles.
     #[error("the map has no drivable lane within 100 m of the ego")]
     NoLane,
@@ -271,7 +272,7 @@ pub enum GenerateError {
         "prompts: no place within 150 m of the ego can hold {prompts}; the map may lack a crosswalk, \
          a stop sign, a lit light or a way that it needs"
     )]
-    NoStage {
+    NoSite {
         /// Their names.
         prompts: String,
     },

@@ -248,7 +248,7 @@ fn a_prompt_that_the_map_cannot_hold_is_an_error() {
     assert!(error.to_string().contains("can hold on_carpark"), "{error}");
     // With free placement no stage is searched, and the verdict reports what is wrong.
     let checked = make(&order("on_carpark", Placement::Free));
-    assert!(!matches!(checked, Err(GenerateError::NoStage { .. })));
+    assert!(!matches!(checked, Err(GenerateError::NoSite { .. })));
 }
 
 #[test]

@@ -5,7 +5,7 @@
 //! products ([`panels`]), sums in a fixed order ([`rows`]), and the row-wise parts of layers that
 //! training and inference share ([`gelu`], [`gru`], [`norm`], [`edge_attention`]). What does not:
 //! tensors, gradients and layers, which are `gump-nn`'s. All `unsafe` of the workspace is in `gemm`
-//! and `kernels`, except one product in `gump-rl`.
+//! and `kernels`.
 //!
 //! Results are bit-identical for any number of threads: work is cut by shape, and sums are added in
 //! a fixed order.

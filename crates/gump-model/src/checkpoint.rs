@@ -165,8 +165,7 @@ impl Archive {
 
 /// Header entries every file of this crate has.
 pub fn header(config: &ModelConfig) -> Result<BTreeMap<String, String>, ModelError> {
-    let config =
-        serde_json::to_string(config).map_err(|error| ModelError::Config(error.to_string()))?;
+    let config = serde_json::to_string(config).map_err(ModelError::Json)?;
     Ok(BTreeMap::from([
         ("format".to_owned(), FORMAT.to_owned()),
         ("vocabulary".to_owned(), VOCABULARY_SIZE.to_string()),

@@ -197,40 +197,58 @@ impl ModelConfig {
     /// # Errors
     /// [`ModelError::Config`] naming the first contradiction.
     pub fn validate(&self) -> Result<(), ModelError> {
-        let fail = |what: String| Err(ModelError::Config(what));
+        let fail = |key: &'static str, reason: String| Err(ModelError::Config { key, reason });
         if self.heads == 0 || !self.width.is_multiple_of(self.heads) {
-            return fail(format!(
-                "width {} is not a multiple of {} heads",
-                self.width, self.heads
-            ));
+            return fail(
+                "heads",
+                format!(
+                    "width {} is not a multiple of {} heads",
+                    self.width, self.heads
+                ),
+            );
         }
         if self.width < 14 {
-            return fail(format!(
-                "width {} leaves no room for the sine of seven fields",
-                self.width
-            ));
+            return fail(
+                "width",
+                format!(
+                    "width {} leaves no room for the sine of seven fields",
+                    self.width
+                ),
+            );
         }
         if self.layers == 0 || self.gru_layers == 0 {
-            return fail("layers and gru_layers must be at least 1".into());
+            let key = if self.layers == 0 {
+                "layers"
+            } else {
+                "gru_layers"
+            };
+            return fail(key, "layers and gru_layers must be at least 1".into());
         }
         if let Some(depth) = self
             .trajectory_heads
             .iter()
             .find(|&&depth| depth >= self.layers)
         {
-            return fail(format!(
-                "trajectory head after block {depth}, but there are {} blocks",
-                self.layers
-            ));
+            return fail(
+                "trajectory_heads",
+                format!(
+                    "trajectory head after block {depth}, but there are {} blocks",
+                    self.layers
+                ),
+            );
         }
         if !(0.0..1.0).contains(&self.dropout) {
-            return fail(format!("dropout {} is not in 0..1", self.dropout));
+            return fail(
+                "dropout",
+                format!("dropout {} is not in 0..1", self.dropout),
+            );
         }
         let (side, stride) = (self.visual.side_px, self.visual.encoder.stride());
         if side == 0 || !side.is_multiple_of(stride) {
-            return fail(format!(
-                "raster side {side} px is not a multiple of the encoder's stride {stride}"
-            ));
+            return fail(
+                "visual.side_px",
+                format!("raster side {side} px is not a multiple of the encoder's stride {stride}"),
+            );
         }
         self.raster_spec().map(|_| ())
     }
@@ -241,8 +259,10 @@ impl ModelConfig {
     /// [`ModelError::Config`] naming a layer that does not exist.
     pub fn raster_spec(&self) -> Result<RasterSpec, ModelError> {
         let layer = |name: &String| {
-            name.parse::<Layer>()
-                .map_err(|_| ModelError::Config(format!("unknown raster layer \"{name}\"")))
+            name.parse::<Layer>().map_err(|_| ModelError::Config {
+                key: "visual.layers",
+                reason: format!("unknown raster layer \"{name}\""),
+            })
         };
         Ok(RasterSpec {
             side_px: self.visual.side_px,

@@ -15,8 +15,22 @@ pub enum ModelError {
     #[error(transparent)]
     Network(gump_nn::NnError),
     /// A configuration contradicts itself.
+    #[error("configuration: {reason}")]
+    Config {
+        /// The key at fault.
+        key: &'static str,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// A configuration cannot be written as JSON.
     #[error("configuration: {0}")]
-    Config(String),
+    Json(serde_json::Error),
+    /// A checkpoint has a tensor that its network does not.
+    #[error("configuration: the checkpoint's tensor \"{name}\" has no place in it")]
+    UnusedTensor {
+        /// Its name.
+        name: String,
+    },
     /// A checkpoint lacks a tensor that the configuration requires.
     #[error("tensor \"{name}\" is missing")]
     MissingTensor {
@@ -38,7 +52,7 @@ pub enum ModelError {
     Kernel(#[from] gump_kernels::KernelError),
     /// Bytes that are not weights, or those of another network.
     #[error("weights: {0}")]
-    Weights(String),
+    Weights(#[from] WeightsError),
     /// A weight cannot be represented in the requested form.
     #[error("tensor \"{name}\" holds {number}, which {form} cannot express")]
     WeightNotFinite {
@@ -69,13 +83,42 @@ pub enum ModelError {
     },
 }
 
+/// Why bytes are not the weights of a network.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum WeightsError {
+    /// The header cannot be read.
+    #[error("expected a safetensors file ({0})")]
+    NotSafetensors(safetensors::SafeTensorError),
+    /// The weights are of another network.
+    #[error("expected weights of the relative network")]
+    OtherNetwork,
+    /// The header has no configuration.
+    #[error("the header has no \"config\"")]
+    NoConfig,
+    /// The configuration in the header cannot be read.
+    #[error("its configuration is not valid ({0})")]
+    InvalidConfig(serde_json::Error),
+    /// The tensors cannot be read.
+    #[error("damaged weights ({0})")]
+    Damaged(safetensors::SafeTensorError),
+    /// The numbers of a tensor have another type.
+    #[error("tensor \"{name}\" has type {found:?}, expected F16 or F32")]
+    TensorType {
+        /// Its name.
+        name: String,
+        /// The type of its numbers.
+        found: safetensors::Dtype,
+    },
+}
+
 #[cfg(feature = "tensors")]
 impl From<gump_nn::NnError> for ModelError {
     fn from(error: gump_nn::NnError) -> Self {
         use gump_nn::NnError;
         match error {
             NnError::Tensor(error) => Self::Tensor(error),
-            NnError::Config(what) => Self::Config(what),
+            NnError::Config { key, reason } => Self::Config { key, reason },
             NnError::MissingTensor { name } => Self::MissingTensor { name },
             NnError::TensorShape {
                 name,

@@ -62,7 +62,7 @@ pub mod trajectory_head;
 pub mod visual;
 
 pub use config::ModelConfig;
-pub use error::ModelError;
+pub use error::{ModelError, WeightsError};
 #[cfg(feature = "tensors")]
 pub use gump_nn::{Device, Parameters};
 #[cfg(feature = "tensors")]

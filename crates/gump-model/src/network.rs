@@ -63,9 +63,9 @@ impl Network {
             .map(|i| TrajectoryHead::new(root.part(format!("trajectory.{i}")), config.width))
             .collect::<Result<_, _>>()?;
         if let Some(name) = parameters.unused().first() {
-            return Err(ModelError::Config(format!(
-                "the checkpoint's tensor \"{name}\" has no place in it"
-            )));
+            return Err(ModelError::UnusedTensor {
+                name: name.to_string(),
+            });
         }
         let packer = Packer::new(&config);
         Ok(Self {

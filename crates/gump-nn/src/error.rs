@@ -8,8 +8,13 @@ pub enum NnError {
     #[error("tensor operation failed: {0}")]
     Tensor(#[from] candle_core::Error),
     /// A configuration contradicts itself.
-    #[error("configuration: {0}")]
-    Config(String),
+    #[error("configuration: {reason}")]
+    Config {
+        /// The key at fault.
+        key: &'static str,
+        /// What is wrong with it.
+        reason: String,
+    },
     /// The tensors that parameters are loaded from lack one.
     #[error("tensor \"{name}\" is missing")]
     MissingTensor {

@@ -72,14 +72,20 @@ impl OptimizerConfig {
         let is_inside = |share: &f64| *share > 0.0 && *share < 1.0;
         let ascend = self.milestones.is_sorted_by(|a, b| a < b);
         if !ascend || !self.milestones.iter().all(is_inside) {
-            return Err(NnError::Config(format!(
-                "milestones are {:?}, expected ascending fractions of the run between 0 and 1",
-                self.milestones
-            )));
+            return Err(NnError::Config {
+                key: "milestones",
+                reason: format!(
+                    "milestones are {:?}, expected ascending fractions of the run between 0 and 1",
+                    self.milestones
+                ),
+            });
         }
         if !(self.drop > 0.0 && self.drop <= 1.0) {
             let drop = self.drop;
-            return Err(NnError::Config(format!("drop {drop} is not in 0..1")));
+            return Err(NnError::Config {
+                key: "drop",
+                reason: format!("drop {drop} is not in 0..1"),
+            });
         }
         Ok(())
     }

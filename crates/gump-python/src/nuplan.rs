@@ -6,7 +6,7 @@ use gump_eval::planners::{PlannerConfig, PlannerName, TimedDriver};
 use gump_eval::recordings::{self, Case};
 use gump_geometry::{Pose, dvec2};
 use gump_nuplan::closed_loop::{
-    DriveConfig, Driver, Imagined, Others, PlannerInitialization, PlannerInput, Recording,
+    DriveConfig, Driver, ImaginedTraffic, Others, PlannerInitialization, PlannerInput, Recording,
     Replayed, Step, Tracking, Traffic,
 };
 use gump_nuplan::metrics::{ClosedLoop, Sample, Scoring, SimulationHistory, score};
@@ -65,7 +65,7 @@ pub(crate) fn nuplan_simulate<'py>(
     let inner: Box<dyn Traffic + Send + '_> = match &model {
         None => Box::new(Replayed),
         Some(_) if rules => Box::new(NuplanIdm::default()),
-        Some(model) => Box::new(Imagined::new(&**model, Seed(seed))),
+        Some(model) => Box::new(ImaginedTraffic::new(&**model, Seed(seed))),
     };
     let mut traffic = Pooled::new(inner)?;
     let config = DriveConfig {

@@ -189,7 +189,7 @@ def test_agents_and_explanations(crossing):
     assert agents.steps.shape == (len(agents.agent_id), 80)
     assert set(agents.agent_id) == {crossing.ego, *crossing.targets}
     assert ((agents.realism > 0) & (agents.realism <= 1)).all()
-    costs = [blame.cost for blame in scores.explanation]
+    costs = [attribution.cost for attribution in scores.explanation]
     assert costs == sorted(costs, reverse=True)
     assert sum(costs) == pytest.approx(1.0 - scores.metametric, abs=1e-6)
 

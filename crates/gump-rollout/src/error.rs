@@ -2,6 +2,38 @@
 
 use gump_scene::AgentId;
 
+/// Why a recording cannot be driven in.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum RecordingDefect {
+    /// There are more or fewer states of the ego than frames.
+    #[error("has {frames} frames but {states} states of the ego")]
+    StateCount {
+        /// Frames of the log.
+        frames: usize,
+        /// States of the ego.
+        states: usize,
+    },
+    /// A frame is not later than the one before.
+    #[error("frame {frame} is not later than the one before")]
+    TimeOrder {
+        /// Index of the frame.
+        frame: usize,
+    },
+    /// The ego is absent in the present.
+    #[error("lacks its ego (agent {ego}) now")]
+    NoEgo {
+        /// The ego.
+        ego: AgentId,
+    },
+    /// There is nothing to drive through.
+    #[error("has {frames} frames after the present, expected two or more")]
+    TooShort {
+        /// Frames after the present.
+        frames: usize,
+    },
+}
+
 /// Why traffic could not be simulated; errors inside a world or a policy are passed on.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
@@ -90,7 +122,7 @@ pub enum RolloutError {
     },
     /// A recording that cannot be driven in.
     #[error("the recording {0}")]
-    Recording(String),
+    Recording(#[from] RecordingDefect),
     /// A plan that no vehicle can drive.
     #[error("the planner asks for {0:.1} m/s, expected less than 50")]
     Speed(f64),

@@ -33,9 +33,9 @@ mod simulate;
 mod world;
 pub mod worlds;
 
-pub use error::RolloutError;
+pub use error::{RecordingDefect, RolloutError};
 pub use policy::{Command, Policy};
 pub use predictive_samples::{PredictiveSamples, ProbeConfig};
 pub use scripted::Scripted;
 pub use simulate::{Interpolation, SimulateConfig, fill, simulate};
-pub use world::{BoxError, Session, Start, WorldModel};
+pub use world::{BoxError, Session, SessionStats, Start, WorldModel};

@@ -20,6 +20,7 @@ pub trait Policy {
 
 /// A command for the ego.
 #[derive(Clone, Debug, PartialEq)]
+#[non_exhaustive]
 pub enum Command {
     /// Follow these states; the first is `dt` seconds ahead, the others `dt` apart.
     Follow {

@@ -229,7 +229,7 @@ impl Run<'_> {
         };
         let (mut position, mut road) = (start.state.pose.position, road_at_start);
         for agent in agents {
-            // Standing agents are many and the look-up is the dearest part of resampling.
+            // Standing agents are many and the look-up is the most expensive part of resampling.
             if agent.state.pose.position != position {
                 position = agent.state.pose.position;
                 road = map.elevation_at(position).unwrap_or(road_at_start);

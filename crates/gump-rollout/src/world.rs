@@ -100,6 +100,17 @@ pub struct Start<'a> {
     pub seed: Seed,
 }
 
+/// Work of a session so far. Numbers that a session does not count are 0.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct SessionStats {
+    /// Passes of a network, whatever their batch size.
+    pub passes: u64,
+    /// Floating-point operations, counting a multiplication and an addition each.
+    pub operations: u64,
+    /// The maximum of the bytes of keys and values that the futures have held at once.
+    pub cache_bytes: usize,
+}
+
 /// Futures in progress. The session owns the state of the world, such as a KV cache.
 pub trait Session {
     /// Seconds between the frames this session yields.
@@ -153,6 +164,11 @@ pub trait Session {
     /// Takes the predictive samples recorded since the last call: step by step, futures in order.
     fn take_predictive_samples(&mut self) -> Vec<PredictiveSamples> {
         Vec::new()
+    }
+
+    /// The work of this session so far, opening included.
+    fn stats(&self) -> SessionStats {
+        SessionStats::default()
     }
 
     /// Reuses the slot of a finished future for a fresh start (of one future).

@@ -24,25 +24,51 @@ use gump_geometry::{DVec2, Polygon, Polyline, Pose, dvec2, wrap_angle};
 
 use crate::{
     Agent, AgentId, AgentKind, AgentState, Area, AreaKind, Frame, Lane, LaneId, LaneKind, Light,
-    LightState, MapGraph, MapParts, RoadEdge, RoadEdgeKind, RoadLine, RoadLineKind, Route,
-    Scenario,
+    LightState, MapError, MapGraph, MapParts, RoadEdge, RoadEdgeKind, RoadLine, RoadLineKind,
+    Route, Scenario, ScenarioError,
 };
+
+/// Why a text is not a scenario.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum FixtureError {
+    /// A statement cannot be read.
+    #[error("line {line}: {reason} in \"{statement}\"")]
+    Statement {
+        /// Number of the line, from 1.
+        line: usize,
+        /// What is wrong with it.
+        reason: String,
+        /// The line without its comment.
+        statement: String,
+    },
+    /// No agent is the ego.
+    #[error("no ego")]
+    NoEgo,
+    /// The map is not valid.
+    #[error(transparent)]
+    Map(#[from] MapError),
+    /// The scenario is not valid.
+    #[error(transparent)]
+    Scenario(#[from] ScenarioError),
+}
 
 /// Reads a scenario from the text form described in the module.
 ///
-/// The error is a plain `String`, not a type: fixtures are written by hand in tests and examples,
-/// where nothing but its text is of use.
-///
 /// # Errors
-/// A sentence with the line at fault.
-pub fn scenario(text: &str) -> Result<Scenario, String> {
+/// The line at fault, or why the scenario is not valid.
+pub fn scenario(text: &str) -> Result<Scenario, FixtureError> {
     let mut draft = Draft::default();
     for (number, line) in text.lines().enumerate() {
         let line = line.split('#').next().unwrap_or_default().trim();
         if !line.is_empty() {
             draft
                 .statement(line)
-                .map_err(|what| format!("line {}: {what} in \"{line}\"", number + 1))?;
+                .map_err(|reason| FixtureError::Statement {
+                    line: number + 1,
+                    reason,
+                    statement: line.to_owned(),
+                })?;
         }
     }
     draft.build()
@@ -198,7 +224,7 @@ impl Draft {
         Ok(())
     }
 
-    fn build(mut self) -> Result<Scenario, String> {
+    fn build(mut self) -> Result<Scenario, FixtureError> {
         let links: Vec<_> = self
             .parts
             .lanes
@@ -215,7 +241,7 @@ impl Draft {
         let log = (0..n_frames)
             .map(|i| self.frame((i as f64 - now as f64) * self.dt))
             .collect();
-        let map = Arc::new(MapGraph::new(self.parts).map_err(|error| error.to_string())?);
+        let map = Arc::new(MapGraph::new(self.parts)?);
         let path: Vec<DVec2> = self
             .route
             .iter()
@@ -236,12 +262,12 @@ impl Draft {
             log,
             dt: self.dt,
             now,
-            ego: self.ego.ok_or("no ego")?,
+            ego: self.ego.ok_or(FixtureError::NoEgo)?,
             targets: self.agents.iter().map(|agent| agent.id).collect(),
             objects_of_interest: Vec::new(),
             tags: Vec::new(),
         };
-        scenario.validate().map_err(|error| error.to_string())?;
+        scenario.validate()?;
         Ok(scenario)
     }
 
@@ -342,10 +368,18 @@ mod tests {
 
     #[test]
     fn errors_name_the_line() {
+        let error = scenario("lane 1: 0,0\nfoo # bar").unwrap_err();
         assert_eq!(
-            scenario("lane 1: 0,0\nfoo").unwrap_err(),
-            "line 2: unknown statement in \"foo\""
+            error,
+            FixtureError::Statement {
+                line: 2,
+                reason: "unknown statement".into(),
+                statement: "foo".into(),
+            }
         );
-        assert_eq!(scenario("lane 1: 0,0 9,9").unwrap_err(), "no ego");
+        assert_eq!(error.to_string(), "line 2: unknown statement in \"foo\"");
+        let error = scenario("lane 1: 0,0 9,9").unwrap_err();
+        assert_eq!(error, FixtureError::NoEgo);
+        assert_eq!(error.to_string(), "no ego");
     }
 }

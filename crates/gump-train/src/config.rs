@@ -5,7 +5,7 @@ use gump_nn::optimizer::OptimizerConfig;
 use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
-use crate::closed_loop::ClosedLoopConfig;
+use crate::closed_loop_samples::ClosedLoopConfig;
 use crate::loss::LossConfig;
 use crate::sample::SampleConfig;
 
@@ -67,19 +67,29 @@ impl TrainConfig {
     /// # Errors
     /// [`TrainError::Config`] naming the first contradiction.
     pub fn validate(&self, processes: usize) -> Result<(), TrainError> {
-        let fail = |what: String| Err(TrainError::Config(what));
+        let fail = |key: &'static str, reason: String| Err(TrainError::Config { key, reason });
         if self.batch == 0 || self.accumulate == 0 {
-            return fail("batch and accumulate must be at least 1".into());
+            let key = if self.batch == 0 {
+                "batch"
+            } else {
+                "accumulate"
+            };
+            return fail(key, "batch and accumulate must be at least 1".into());
         }
         if self.batch < self.accumulate * processes {
-            return fail(format!(
-                "a batch of {} cannot be shared among {processes} processes with {} parts each",
-                self.batch, self.accumulate
-            ));
+            return fail(
+                "batch",
+                format!(
+                    "a batch of {} cannot be shared among {processes} processes with {} parts each",
+                    self.batch, self.accumulate
+                ),
+            );
         }
         self.optimizer.validate()?;
         match self.ema {
-            Some(ema) if !(0.0..1.0).contains(&ema) => fail(format!("ema {ema} is not in 0..1")),
+            Some(ema) if !(0.0..1.0).contains(&ema) => {
+                fail("ema", format!("ema {ema} is not in 0..1"))
+            }
             _ => Ok(()),
         }
     }
@@ -111,22 +121,20 @@ impl RunConfig {
     /// Reads the TOML form.
     ///
     /// # Errors
-    /// [`TrainError::Config`] with the place and the key at fault.
+    /// [`TrainError::Toml`] with the place and the key at fault.
     pub fn from_toml(text: &str) -> Result<Self, TrainError> {
-        toml::from_str(text).map_err(|error| TrainError::Config(error.to_string()))
+        toml::from_str(text).map_err(TrainError::Toml)
     }
 
     /// The model's shape.
     ///
     /// # Errors
-    /// [`TrainError::Config`] for a preset that does not exist.
+    /// [`TrainError::UnknownPreset`].
     pub fn model(&self) -> Result<ModelConfig, TrainError> {
         match &self.model {
             ModelChoice::Config(config) => Ok((**config).clone()),
-            ModelChoice::Preset(name) => ModelConfig::preset(name).ok_or_else(|| {
-                let known = ModelConfig::PRESETS.join(", ");
-                TrainError::Config(format!("unknown model \"{name}\", expected one of {known}"))
-            }),
+            ModelChoice::Preset(name) => ModelConfig::preset(name)
+                .ok_or_else(|| TrainError::UnknownPreset { name: name.clone() }),
         }
     }
 }

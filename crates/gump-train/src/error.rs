@@ -1,16 +1,42 @@
 //! Errors of this crate.
 
 use gump_engine::EngineError;
-use gump_model::ModelError;
+use gump_model::{ModelConfig, ModelError};
 use gump_rollout::BoxError;
 
 /// An error of a training run.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum TrainError {
-    /// A number of the configuration is out of its range, or a key is unknown.
+    /// A value of the configuration is out of its range.
+    #[error("configuration: {reason}")]
+    Config {
+        /// The key at fault, with those of its tables.
+        key: &'static str,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// A configuration cannot be read from TOML.
     #[error("configuration: {0}")]
-    Config(String),
+    Toml(toml::de::Error),
+    /// A configuration cannot be written as JSON.
+    #[error("configuration: {0}")]
+    Json(serde_json::Error),
+    /// A preset of the model that does not exist.
+    #[error(
+        "configuration: unknown model \"{name}\", expected one of {}",
+        ModelConfig::PRESETS.join(", ")
+    )]
+    UnknownPreset {
+        /// The name given.
+        name: String,
+    },
+    /// No scene can be compared with its log, as rewards of realism need.
+    #[error(
+        "configuration: realism: no scene has the second of past and the eight seconds of future \
+         at 10 Hz, the road edges and the agents that its rollouts are compared with"
+    )]
+    NoComparableScene,
     /// Training diverged.
     #[error(
         "the loss is not a number at step {step} (field {field}); the last checkpoint is intact"
@@ -27,9 +53,9 @@ pub enum TrainError {
         /// Frames a sample needs.
         frames: usize,
     },
-    /// Processes that train together lost their connection.
+    /// Processes cannot train together, or one of them failed.
     #[error("processes that train together: {0}")]
-    Peers(String),
+    ProcessGroup(#[from] ProcessGroupError),
     /// A scenario has no frames at the rate of samples.
     #[error("scene: {id} has a frame every {dt} s, expected a time step that divides {expected} s")]
     TimeStep {
@@ -54,6 +80,21 @@ pub enum TrainError {
     Model(#[from] ModelError),
 }
 
+/// Why processes do not train together.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ProcessGroupError {
+    /// This process has joined the others before.
+    #[error("MPI can be joined once by a process, and was before")]
+    AlreadyJoined,
+    /// Another process could not draw its samples, so this one stops, too.
+    #[error("another one could not draw its samples")]
+    NoSamples,
+    /// The connection to another process failed.
+    #[error("{0}")]
+    Connection(BoxError),
+}
+
 impl From<candle_core::Error> for TrainError {
     fn from(error: candle_core::Error) -> Self {
         Self::Model(error.into())
@@ -72,7 +113,10 @@ mod tests {
 
     #[test]
     fn errors_from_below_are_told_as_they_are() {
-        let error = TrainError::from(gump_nn::NnError::Config("odd".into()));
+        let error = TrainError::from(gump_nn::NnError::Config {
+            key: "drop",
+            reason: "odd".into(),
+        });
         assert_eq!(error.to_string(), "configuration: odd");
         let error = TrainError::Source("rotten".into());
         assert_eq!(error.to_string(), "scene: rotten");

@@ -108,8 +108,7 @@ impl TrainState {
             drivers.map(|(name, tensor)| (format!("{}{name}", checkpoint::DRIVER), tensor.clone())),
         );
         let mut header = checkpoint::header(self.network.config())?;
-        let config =
-            serde_json::to_string(config).map_err(|e| TrainError::Config(e.to_string()))?;
+        let config = serde_json::to_string(config).map_err(TrainError::Json)?;
         header.insert("train".to_owned(), config);
         header.insert("step".to_owned(), self.step.to_string());
         Ok(checkpoint::write(path, tensors, header, StorageType::Full)?)

@@ -1,8 +1,8 @@
 //! Training of the learned world models.
 //!
 //! For the sequence network: samples ([`sample`]), losses ([`loss`]), closed-loop training
-//! ([`closed_loop`]) and the trainer ([`Trainer`]). For the relative network: its own rollouts as
-//! training data, rewards, and the trainer ([`relative`]). Runs resume exactly, and the same seed
+//! ([`closed_loop_samples`]) and the trainer ([`Trainer`]). For the relative network: its own
+//! rollouts as training data, rewards, and the trainer ([`relative`]). Runs resume exactly, and the same seed
 //! gives the same result for any number of threads. The networks are in `gump-model`; command line,
 //! progress and output files are in `xtask`.
 //!
@@ -24,7 +24,7 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
-pub mod closed_loop;
+pub mod closed_loop_samples;
 mod config;
 mod error;
 mod gradients;
@@ -42,9 +42,9 @@ mod source;
 mod tests;
 mod trainer;
 
-pub use closed_loop::ClosedLoopConfig;
+pub use closed_loop_samples::ClosedLoopConfig;
 pub use config::{ModelChoice, RunConfig, TrainConfig};
-pub use error::TrainError;
+pub use error::{ProcessGroupError, TrainError};
 pub use gump_nn::OptimizerConfig;
 pub use loss::{LossConfig, LossParts};
 #[cfg(feature = "mpi")]

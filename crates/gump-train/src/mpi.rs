@@ -8,7 +8,7 @@ use mpi::environment::Universe;
 use mpi::traits::Communicator as _;
 
 use super::process_group::ProcessGroup;
-use crate::TrainError;
+use crate::{ProcessGroupError, TrainError};
 
 /// The processes started by `mpirun`.
 #[derive(Clone)]
@@ -20,13 +20,12 @@ impl Mpi {
     /// Joins the group; a process that `mpirun` did not start is alone.
     ///
     /// # Errors
-    /// [`TrainError::Peers`] if this process has joined before.
+    /// [`TrainError::ProcessGroup`] if this process has joined before.
     pub fn join() -> Result<Self, TrainError> {
         // Other threads compute; only this one talks.
         let joined = mpi::initialize_with_threading(Threading::Funneled);
-        let (universe, _) = joined.ok_or_else(|| {
-            TrainError::Peers("MPI can be joined once by a process, and was before".into())
-        })?;
+        let (universe, _) =
+            joined.ok_or_else(|| TrainError::from(ProcessGroupError::AlreadyJoined))?;
         Ok(Self {
             universe: universe.into(),
         })

@@ -13,7 +13,7 @@ use gump_geometry::{DVec2, wrap_angle};
 use gump_scene::{AgentId, AgentKind, Frame, Rng, Scenario};
 use rand::Rng as _;
 
-use crate::closed_loop::DrivenScenario;
+use crate::closed_loop_samples::DrivenScenario;
 
 /// Share of the displacement that is left half a second later: about half after a second. Chosen by
 /// hand; docs/results/0011-surroundings.md has the effect of the whole.

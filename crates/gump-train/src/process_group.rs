@@ -16,7 +16,7 @@ pub trait ProcessGroup {
     /// Replaces every number by its sum over all processes, with equal bits on each.
     ///
     /// # Errors
-    /// [`TrainError::Peers`] if the connection to another process is lost.
+    /// [`TrainError::ProcessGroup`] if the connection to another process is lost.
     fn sum(&self, numbers: &mut [f32]) -> Result<(), TrainError>;
 }
 

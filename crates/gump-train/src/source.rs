@@ -8,7 +8,7 @@ use gump_scene::{Scenario, Seed};
 use rand::Rng as _;
 
 use crate::TrainError;
-use crate::closed_loop::{ClosedLoopConfig, DrivenScenario};
+use crate::closed_loop_samples::{ClosedLoopConfig, DrivenScenario};
 use crate::sample::{Driven, Reader, Sample, SampleConfig, draw};
 use crate::scenes::ScenarioSource;
 

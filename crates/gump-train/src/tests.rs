@@ -16,7 +16,7 @@ use gump_rollout::{Start, WorldModel};
 use gump_scene::{Scenario, Seed, fixture};
 
 use crate::TrainError;
-use crate::closed_loop::ClosedLoopConfig;
+use crate::closed_loop_samples::ClosedLoopConfig;
 use crate::config::TrainConfig;
 use crate::gradients::BatchGradients;
 use crate::loss::LossParts;

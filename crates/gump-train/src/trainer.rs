@@ -19,8 +19,7 @@ use gump_model::config::ModelConfig;
 use gump_nn::layers::Dropout;
 use gump_nn::ops::Deferred;
 
-use crate::TrainError;
-use crate::closed_loop;
+use crate::closed_loop_samples;
 use crate::config::TrainConfig;
 use crate::gradients::{BatchGradients, Part};
 use crate::learner::TrainState;
@@ -29,6 +28,7 @@ use crate::process_group::{ProcessGroup, SingleProcess};
 use crate::sample::{Reader, Sample, SampleConfig, draw};
 use crate::scenes::ScenarioSource;
 use crate::source::{SampleReceiver, SampleSource, check_rate, prefetch};
+use crate::{ProcessGroupError, TrainError};
 
 /// The result of one step.
 #[derive(Clone, Debug, Serialize)]
@@ -125,7 +125,12 @@ impl Trainer {
         let drives = match &config.closed_loop {
             Some(closed_loop) => {
                 let seed = Seed(config.seed).fork(3);
-                closed_loop::drive(learner.driver()?, scenarios.as_ref(), closed_loop, seed)?
+                closed_loop_samples::drive(
+                    learner.driver()?,
+                    scenarios.as_ref(),
+                    closed_loop,
+                    seed,
+                )?
             }
             None => Vec::new(),
         };
@@ -165,7 +170,7 @@ impl Trainer {
     ///
     /// # Errors
     /// [`TrainError::LossNotFinite`] before anything is changed, [`TrainError::Source`] for a
-    /// scenario that cannot be read, [`TrainError::Peers`] if another process failed, or a tensor
+    /// scenario that cannot be read, [`TrainError::ProcessGroup`] if another process failed, or a tensor
     /// error.
     pub fn step(&mut self) -> Result<StepReport, TrainError> {
         let no_data = TrainError::NoData {
@@ -174,8 +179,7 @@ impl Trainer {
         let drawn = self.next.recv().unwrap_or(Err(no_data));
         if self.any(drawn.is_err())? {
             drawn?;
-            let why = "another one could not draw its samples".to_owned();
-            return Err(TrainError::Peers(why));
+            return Err(ProcessGroupError::NoSamples.into());
         }
         let samples = drawn?;
         let share = share(&self.config, &*self.group);
@@ -335,7 +339,7 @@ impl Trainer {
     /// True if it is true in any process.
     ///
     /// # Errors
-    /// [`TrainError::Peers`] if the connection to another process is lost.
+    /// [`TrainError::ProcessGroup`] if the connection to another process is lost.
     pub fn any(&self, flag: bool) -> Result<bool, TrainError> {
         let mut number = [f32::from(u8::from(flag))];
         self.group.sum(&mut number)?;

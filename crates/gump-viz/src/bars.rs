@@ -207,7 +207,9 @@ impl Plot for Bars {
         });
         let ends: Vec<f64> = ends.filter(|end| end.is_finite()).collect();
         if ends.is_empty() {
-            return Err(VizError::EmptyChart(self.title.clone()));
+            return Err(VizError::EmptyChart {
+                title: self.title.clone(),
+            });
         }
         let low = ends.iter().copied().fold(0.0, f64::min);
         let high = ends.iter().copied().fold(0.0, f64::max);

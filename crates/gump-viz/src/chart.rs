@@ -179,7 +179,9 @@ impl Plot for Chart {
         let spans = self.series.iter().flat_map(|series| &series.spans);
         let ends = spans.flat_map(|&(_, low, high)| [low, high]);
         let ends = ends.filter(|&y| self.fits(y, self.log_y));
-        let empty = || VizError::EmptyChart(self.title.clone());
+        let empty = || VizError::EmptyChart {
+            title: self.title.clone(),
+        };
         let x = match self.categories.len() {
             0 => range(points().map(|p| p.0), self.log_x, 0.0).ok_or_else(empty)?,
             n => (0.5, n as f64 + 0.5),

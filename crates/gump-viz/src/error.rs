@@ -44,8 +44,11 @@ pub enum VizError {
     #[error("a film needs at least one rollout")]
     NothingToFilm,
     /// No series has a finite point (for logarithmic axes: a positive one).
-    #[error("chart \"{0}\" has no point to draw")]
-    EmptyChart(String),
+    #[error("chart \"{title}\" has no point to draw")]
+    EmptyChart {
+        /// Title of the chart.
+        title: String,
+    },
     /// The chart backend refused.
     #[error("could not draw chart \"{title}\": {reason}")]
     Chart {

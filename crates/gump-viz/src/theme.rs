@@ -4,6 +4,7 @@ use gump_scene::{AgentKind, LightState};
 
 /// On which ground to draw.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
+#[non_exhaustive]
 pub enum Theme {
     /// Dark on light, for print and day.
     #[default]

@@ -48,7 +48,7 @@ pub struct Viewer<'a> {
 }
 
 /// The log or a future, as the page knows it.
-struct Take<'a> {
+struct ShownRollout<'a> {
     name: &'a str,
     /// Seconds from the present to the first frame.
     first: f64,
@@ -234,15 +234,15 @@ impl<'a> Viewer<'a> {
     }
 
     /// The log, then the futures with the present as their first frame.
-    fn takes(&self) -> Vec<Take<'_>> {
+    fn takes(&self) -> Vec<ShownRollout<'_>> {
         let scenario = self.scenario;
-        let log = Take {
+        let log = ShownRollout {
             name: "log",
             first: -(scenario.now as f64) * scenario.dt,
             dt: scenario.dt,
             frames: scenario.log.iter().collect(),
         };
-        let futures = self.futures.iter().map(|(name, rollout)| Take {
+        let futures = self.futures.iter().map(|(name, rollout)| ShownRollout {
             name,
             first: 0.0,
             dt: rollout.dt(),
@@ -318,7 +318,7 @@ fn class_of(kind: AreaKind) -> Option<Class> {
 }
 
 /// Every agent of any take by id, as it is in the present or else first seen.
-fn agents(scenario: &Scenario, takes: &[Take<'_>]) -> Vec<Agent> {
+fn agents(scenario: &Scenario, takes: &[ShownRollout<'_>]) -> Vec<Agent> {
     let present = scenario.log[scenario.now].agents();
     let later = takes.iter().flat_map(|take| &take.frames);
     let mut agents = BTreeMap::<AgentId, Agent>::new();
@@ -329,7 +329,7 @@ fn agents(scenario: &Scenario, takes: &[Take<'_>]) -> Vec<Agent> {
 }
 
 /// Every light of any take, by lane, and where to draw it.
-fn lights(map: &MapGraph, takes: &[Take<'_>]) -> Vec<(Light, DVec2)> {
+fn lights(map: &MapGraph, takes: &[ShownRollout<'_>]) -> Vec<(Light, DVec2)> {
     let mut lights = BTreeMap::new();
     for light in takes
         .iter()
@@ -345,7 +345,7 @@ fn lights(map: &MapGraph, takes: &[Take<'_>]) -> Vec<(Light, DVec2)> {
 }
 
 /// The corners of the world that is worth keeping.
-fn window(takes: &[Take<'_>]) -> (DVec2, DVec2) {
+fn window(takes: &[ShownRollout<'_>]) -> (DVec2, DVec2) {
     let frames = takes.iter().flat_map(|take| &take.frames);
     let (mut low, mut high) = (DVec2::INFINITY, DVec2::NEG_INFINITY);
     for agent in frames.flat_map(|frame| frame.agents()) {

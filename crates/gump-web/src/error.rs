@@ -1,5 +1,7 @@
 //! Errors of the game, as sentences for the page.
 
+use gump_nuplan::metrics::NuPlanError;
+
 /// Errors of the game, each one sentence for the player.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -68,7 +70,7 @@ pub enum GameError {
     Over(usize),
     /// A moment that has not been driven.
     #[error("The moment {asked:.1} s has not been driven: the drive is {driven:.1} s long.")]
-    PlannerInput {
+    NotDriven {
         /// The requested moment, seconds.
         asked: f64,
         /// Length of the drive, seconds.
@@ -76,11 +78,41 @@ pub enum GameError {
     },
     /// A link that holds no drive.
     #[error("This link holds no drive that can be replayed: {0}.")]
-    Link(&'static str),
-    /// The drive is too short for the requested score.
-    #[error("{0}")]
-    TooShort(&'static str),
+    Link(#[from] LinkError),
+    /// The drive is too short to be scored.
+    #[error("Nothing to score yet: drive for two seconds or more.")]
+    TooShort,
+    /// The drive is too short for its realism.
+    #[error("Realism is measured over eight seconds: drive on.")]
+    TooShortForRealism,
+    /// The recording cannot be compared with.
+    #[error("Realism needs a recording of one second before and eight after the start.")]
+    NoRecording,
     /// A score that cannot be computed.
     #[error("The drive cannot be scored: {0}.")]
-    Score(String),
+    Score(NuPlanError),
+}
+
+/// Why a link holds no drive.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum LinkError {
+    /// It is no text of this encoding.
+    #[error("it was cut off or changed on its way")]
+    Damaged,
+    /// It is of another version.
+    #[error("it is of another version of this page")]
+    OtherVersion,
+    /// It ends within an input.
+    #[error("it was cut off")]
+    CutOff,
+    /// It has more inputs than a drive.
+    #[error("it is longer than a drive can be")]
+    TooLong,
+    /// It names an unknown driver.
+    #[error("it names a driver that there is not")]
+    NoSuchDriver,
+    /// It names an unknown gear.
+    #[error("it names a gear that there is not")]
+    NoSuchGear,
 }

@@ -333,7 +333,7 @@ impl Game {
     /// Rewinds the drive to so many frames after its start.
     ///
     /// # Errors
-    /// [`GameError::PlannerInput`] for a moment that has not been driven.
+    /// [`GameError::NotDriven`] for a moment that has not been driven.
     pub fn rewind(&mut self, frame: usize) -> Result<(), GameError> {
         self.check_moment(frame)?;
         let knot = frame / STRIDE;
@@ -407,7 +407,7 @@ impl Game {
     /// Begins eight futures from so many frames after the start, at the half second before it.
     ///
     /// # Errors
-    /// [`GameError::PlannerInput`] for a moment that has not been driven.
+    /// [`GameError::NotDriven`] for a moment that has not been driven.
     pub fn branch(&mut self, frame: usize) -> Result<(), GameError> {
         self.check_moment(frame)?;
         let knot = frame / STRIDE;
@@ -455,7 +455,7 @@ impl Game {
     /// The scene as it was so many frames after the start.
     ///
     /// # Errors
-    /// [`GameError::PlannerInput`] for a moment that has not been driven.
+    /// [`GameError::NotDriven`] for a moment that has not been driven.
     pub fn at(&self, frame: usize) -> Result<SceneState<'_>, GameError> {
         self.check_moment(frame)?;
         let scene = self.scene();
@@ -543,7 +543,7 @@ impl Game {
         if frame <= self.driven() {
             return Ok(());
         }
-        Err(GameError::PlannerInput {
+        Err(GameError::NotDriven {
             asked: frame as f64 * DT,
             driven: self.driven() as f64 * DT,
         })

@@ -21,7 +21,7 @@ mod wasm;
 
 pub use branches::{Branch, Branches, FUTURES, STEPS};
 pub use engine::compute_as_browsers_do;
-pub use error::GameError;
+pub use error::{GameError, LinkError};
 pub use game::{
     DT, Event, EventKind, FAN_STEPS, Fan, Game, MAX_AGENTS, MAX_FRAMES, MAX_POINTS, Settings,
 };

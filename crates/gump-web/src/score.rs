@@ -35,17 +35,18 @@ impl Game {
     pub fn score(&self) -> Result<DriveScore, GameError> {
         let driven = self.driven();
         if driven < SHORTEST {
-            let what = "Nothing to score yet: drive for two seconds or more.";
-            return Err(GameError::TooShort(what));
+            return Err(GameError::TooShort);
         }
-        let refused =
-            |error: gump_nuplan::metrics::NuPlanError| GameError::Score(error.to_string());
         let whole = RolloutHistory::new(&self.rollout(driven), self.scenario());
-        let mut parts = score(&whole.on(self.map())).map_err(refused)?.scores();
+        let mut parts = score(&whole.on(self.map()))
+            .map_err(GameError::Score)?
+            .scores();
         let recorded = self.scenario().future().len().min(driven);
         if recorded < driven && recorded >= SHORTEST {
             let begun = RolloutHistory::new(&self.rollout(recorded), self.scenario());
-            let begun = score(&begun.on(self.map())).map_err(refused)?.scores();
+            let begun = score(&begun.on(self.map()))
+                .map_err(GameError::Score)?
+                .scores();
             for name in COMPARED {
                 if let Some(&compared) = begun.get(name) {
                     parts.insert(name.into(), compared);
@@ -64,16 +65,12 @@ impl Game {
     /// rollout, whichever driver drove the ego.
     ///
     /// # Errors
-    /// [`GameError::TooShort`] for a drive or a recording of less than eight seconds.
+    /// [`GameError::TooShortForRealism`], [`GameError::NoRecording`].
     pub fn realism(&self) -> Result<f64, GameError> {
         if self.driven() < N_FUTURE {
-            let what = "Realism is measured over eight seconds: drive on.";
-            return Err(GameError::TooShort(what));
+            return Err(GameError::TooShortForRealism);
         }
-        let failed = |_| {
-            let what = "Realism needs a recording of one second before and eight after the start.";
-            GameError::TooShort(what)
-        };
+        let failed = |_| GameError::NoRecording;
         let log = Log::of(self.scenario()).map_err(failed)?;
         let config = Config::of(Year::Y2025);
         let rollouts = [self.rollout(N_FUTURE)];

@@ -7,7 +7,7 @@
 use base64::Engine as _;
 use base64::engine::general_purpose::URL_SAFE_NO_PAD;
 
-use crate::GameError;
+use crate::{GameError, LinkError};
 
 /// Driver of the ego.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -113,21 +113,21 @@ pub fn encode(inputs: &[Input]) -> String {
 pub fn decode(code: &str, limit: usize) -> Result<Vec<Input>, GameError> {
     let bytes = URL_SAFE_NO_PAD
         .decode(code.trim())
-        .map_err(|_| GameError::Link("it was cut off or changed on its way"))?;
+        .map_err(|_| LinkError::Damaged)?;
     let versions = [FORWARD, GEARED];
     let known = bytes.split_first().and_then(|(version, runs)| {
         let found = versions.iter().find(|(known, _)| known == version);
         Some((runs, found?.1))
     });
-    let (runs, n_bytes) = known.ok_or(GameError::Link("it is of another version of this page"))?;
+    let (runs, n_bytes) = known.ok_or(LinkError::OtherVersion)?;
     if !runs.len().is_multiple_of(n_bytes) {
-        return Err(GameError::Link("it was cut off"));
+        return Err(LinkError::CutOff.into());
     }
     let mut inputs = Vec::new();
     for run in runs.chunks(n_bytes) {
         let (n, input) = decode_run(run)?;
         if inputs.len() + n > limit {
-            return Err(GameError::Link("it is longer than a drive can be"));
+            return Err(LinkError::TooLong.into());
         }
         inputs.extend(std::iter::repeat_n(input, n));
     }
@@ -137,14 +137,14 @@ pub fn decode(code: &str, limit: usize) -> Result<Vec<Input>, GameError> {
 /// Decodes a run: the number of repetitions, and the input.
 fn decode_run(run: &[u8]) -> Result<(usize, Input), GameError> {
     let &[low, high, driver, pedal, wheel, temperature, ref gear @ ..] = run else {
-        return Err(GameError::Link("it was cut off"));
+        return Err(LinkError::CutOff.into());
     };
     let driver = EgoDriver::ALL.get(usize::from(driver));
-    let driver = *driver.ok_or(GameError::Link("it names a driver that there is not"))?;
+    let driver = *driver.ok_or(LinkError::NoSuchDriver)?;
     let reverse = match gear {
         [] | [0] => false,
         [1] => true,
-        _ => return Err(GameError::Link("it names a gear that there is not")),
+        _ => return Err(LinkError::NoSuchGear.into()),
     };
     let input = Input {
         driver,

@@ -167,7 +167,7 @@ impl Game {
     /// then the colour of each light (0 unknown, 1 red, 2 yellow, 3 green).
     ///
     /// # Errors
-    /// [`GameError::PlannerInput`] for a moment that has not been driven.
+    /// [`GameError::NotDriven`] for a moment that has not been driven.
     pub fn numbers(&self, frame: usize) -> Result<Vec<f32>, GameError> {
         let scene = self.at(frame)?;
         let origin = self.origin();

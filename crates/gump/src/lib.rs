@@ -24,7 +24,7 @@
 //! ```
 //!
 //! # Features
-//! The modules [`geometry`], [`scene`], [`rollout`] and [`metrics`] are always there. A feature adds
+//! The modules [`geometry`], [`seed`], [`scene`], [`rollout`] and [`metrics`] are always there. A feature adds
 //! the module of its name, and those that it needs.
 //!
 //! | Feature | What it adds |
@@ -34,6 +34,7 @@
 //! | `viz` | pictures, films, pages; with `rerun` recordings for its viewer |
 //! | `wosac` | Waymo's realism and motion prediction metrics |
 //! | `nuplan`, `planner` | nuPlan's closed loop and scores; planners |
+//! | `grpc`, `proto` | planners in other processes; messages of Waymo and of nuPlan's protocol |
 //! | `traffic`, `synthesis` | signals and agents that come and leave; made-up scenarios |
 //! | `engine`, `tensors` | the learned worlds: from plain weights; on a tensor library, with `inputs` |
 //! | `train`, `generate` | training; scenes from a prompt; with `cuda` on a GPU |
@@ -50,21 +51,28 @@ pub use gump_eval as eval;
 #[cfg(feature = "generate")]
 pub use gump_generate as generate;
 pub use gump_geometry as geometry;
+#[cfg(feature = "grpc")]
+pub use gump_grpc as grpc;
 #[cfg(feature = "engine")]
 pub use gump_kernels as kernels;
 pub use gump_metrics as metrics;
 #[cfg(feature = "engine")]
 pub use gump_model as model;
+#[cfg(feature = "tensors")]
+pub use gump_nn as nn;
 #[cfg(feature = "nuplan")]
 pub use gump_nuplan as nuplan;
 #[cfg(feature = "planner")]
 pub use gump_planner as planner;
+#[cfg(feature = "proto")]
+pub use gump_proto as proto;
 #[cfg(feature = "inputs")]
 pub use gump_raster as raster;
 #[cfg(feature = "rl")]
 pub use gump_rl as rl;
 pub use gump_rollout as rollout;
 pub use gump_scene as scene;
+pub use gump_seed as seed;
 #[cfg(feature = "synthesis")]
 pub use gump_synthesis as synthesis;
 #[cfg(feature = "inputs")]
@@ -98,7 +106,7 @@ pub mod prelude {
     pub use crate::model::{Device, checkpoint};
     #[cfg(feature = "nuplan")]
     pub use crate::nuplan::closed_loop::{
-        DriveConfig, Driver, Imagined, PlannerInput, Replayed, Traffic,
+        DriveConfig, Driver, ImaginedTraffic, PlannerInput, Replayed, Traffic,
     };
     #[cfg(feature = "nuplan")]
     pub use crate::nuplan::{reactive_agents::NuplanIdm, tracking::Trajectory};

@@ -8,6 +8,7 @@ use anyhow::Context as _;
 use gump_data::find_map;
 use gump_engine::placement::object_spec::ObjectSpec;
 use gump_engine::{LightSource, SamplingConfig, TransformerWorld};
+use gump_eval::Notes;
 use gump_eval::worlds::{self, World, WorldName};
 use gump_generate::check::{off_road, overlaps};
 use gump_generate::constraint::parse_constraints;
@@ -23,7 +24,7 @@ use crate::choices::{LIGHTS, PLACEMENTS, one_of};
 use crate::cli::WrongArguments;
 use crate::films::FilmArgs;
 use crate::run::{Common, Run, stop_if_interrupted};
-use crate::shipped;
+use crate::{notes, shipped};
 
 /// Scenes made together, by all threads, before progress is shown and an interrupt looked for.
 /// Chosen by hand.
@@ -147,7 +148,13 @@ impl Args {
         };
         let (checked, elapsed) = run.phase("generate", |run| self.make(run, worlds, &order))?;
         run.phase("write", |run| write(run, &checked, &self.film))?;
-        report(run, &checked, elapsed)
+        report(run, &checked, elapsed)?;
+        let mut noted = Notes::default();
+        let simulated = checked.iter().map(|checked| &checked.scenario);
+        for scenario in simulated.filter(|scenario| !scenario.future().is_empty()) {
+            noted.merge(&traffic.notes(scenario));
+        }
+        notes::report(run, &noted, checked.len())
     }
 
     fn check_numbers(&self) -> anyhow::Result<()> {
@@ -388,6 +395,14 @@ fn count(checked: &CheckedScene, wanted: impl Fn(AgentKind) -> bool) -> usize {
     agents.filter(|agent| wanted(agent.kind)).count()
 }
 
+/// Mean over scenes of the share of their simulated time in which clause `i` holds; `None` if one is
+/// not simulated or the clause cannot be decided.
+fn share_of_time(checked: &[CheckedScene], i: usize) -> Option<f64> {
+    let shares = checked.iter().map(|m| m.clauses[i].share_of_time);
+    let shares: Vec<f64> = shares.collect::<Option<_>>()?;
+    (!shares.is_empty()).then(|| shares.iter().sum::<f64>() / shares.len() as f64)
+}
+
 /// Per clause whether it holds; of several scenes, in all of them, with the share in which it does.
 fn clauses(checked: &[CheckedScene]) -> Vec<Value> {
     let first = checked.first().map_or(&[][..], |checked| &checked.clauses);
@@ -411,6 +426,7 @@ fn clauses(checked: &[CheckedScene]) -> Vec<Value> {
             "holds": if failing { Some(false) } else { clause.holds },
             "share": holding as f64 / checked.len() as f64,
             "holds_throughout": is_told.then(|| !later.contains(&Some(false))),
+            "share_of_time": share_of_time(checked, i),
         })
     };
     first.iter().enumerate().map(row).collect()

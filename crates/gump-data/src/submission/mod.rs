@@ -193,19 +193,17 @@ pub fn with_heights<'a>(
 /// are wrapped to [-π, π), lights stay as they are at the present.
 ///
 /// # Errors
-/// [`Problem::Rollouts`] if the message does not fit the scenario: another id, agents that are
-/// missing, unknown or duplicated, columns of different lengths, numbers that are not finite.
+/// [`Problem::OtherScenario`], or [`Problem::Future`] if one does not fit the scenario: agents that
+/// are missing, unknown or duplicated, columns of different lengths, numbers that are not finite.
 pub fn rollouts_from_proto(
     message: &ScenarioRollouts,
     scenario: &Scenario,
 ) -> Result<Vec<Rollout>, Problem> {
     if message.scenario_id() != scenario.id {
-        let found = message.scenario_id();
-        let problem = format!(
-            "expected rollouts of scenario {}, found {found}",
-            scenario.id
-        );
-        return Err(Problem::Rollouts(problem));
+        return Err(Problem::OtherScenario {
+            expected: scenario.id.as_str().into(),
+            found: message.scenario_id().into(),
+        });
     }
     let present = present_agents(scenario);
     let message = with_heights(message, scenario);
@@ -214,7 +212,10 @@ pub fn rollouts_from_proto(
         .map(|(k, scene)| {
             let problems = scene_problems(scene, &present);
             if let Some(problem) = problems.into_iter().next() {
-                return Err(Problem::Rollouts(format!("future {k}: {problem}")));
+                return Err(Problem::Future {
+                    future: k,
+                    problem: problem.into(),
+                });
             }
             Ok(rollout(scene, scenario))
         })

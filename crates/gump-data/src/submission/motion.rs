@@ -64,8 +64,8 @@ pub fn write_predictions(
 /// scenario is not checked here, see [`prediction_problems`].
 ///
 /// # Errors
-/// [`Problem::Predictions`] if the message has no predictions, a path has more positions in one
-/// direction than in the other, or the modes of a joint prediction are of different objects.
+/// [`Problem::NoPredictions`], [`Problem::MixedAgents`], [`Problem::NoTrajectory`],
+/// [`Problem::UnequalPositions`].
 pub fn predictions_from_proto(
     message: &ChallengeScenarioPredictions,
 ) -> Result<Vec<Prediction>, Problem> {
@@ -74,7 +74,7 @@ pub fn predictions_from_proto(
             set.predictions.iter().map(single_prediction).collect()
         }
         Some(PredictionKind::JointPrediction(joint)) => Ok(vec![joint_prediction(joint)?]),
-        None => Err(wrong("expected single or joint predictions, found none")),
+        None => Err(Problem::NoPredictions),
     }
 }
 
@@ -105,9 +105,7 @@ fn joint_prediction(message: &JointPrediction) -> Result<Prediction, Problem> {
             && own.len() == agents.len()
             && agents.iter().all(|agent| own.contains(agent));
         if !same {
-            return Err(wrong(&format!(
-                "mode {m} is of other agents than mode 0, or of one agent twice"
-            )));
+            return Err(Problem::MixedAgents { mode: m });
         }
         let of_agent = |agent: &AgentId| {
             let found = joint.trajectories.iter().find(|t| id(t) == *agent);
@@ -129,16 +127,12 @@ fn path(
     mode: usize,
 ) -> Result<Vec<DVec2>, Problem> {
     let Some(trajectory) = trajectory else {
-        return Err(wrong(&format!(
-            "mode {mode} of agent {agent} has no trajectory"
-        )));
+        return Err(Problem::NoTrajectory { mode, agent });
     };
     let (x, y) = (&trajectory.center_x, &trajectory.center_y);
     if x.len() != y.len() {
-        let (nx, ny) = (x.len(), y.len());
-        return Err(wrong(&format!(
-            "mode {mode} of agent {agent} has {nx} numbers center_x and {ny} center_y"
-        )));
+        let (x, y) = (x.len(), y.len());
+        return Err(Problem::UnequalPositions { mode, agent, x, y });
     }
     let point = |(&x, &y): (&f32, &f32)| dvec2(x.into(), y.into());
     Ok(x.iter().zip(y).map(point).collect())
@@ -298,8 +292,4 @@ fn mode_problems(prediction: &Prediction, problems: &mut Vec<String>) {
             }
         }
     }
-}
-
-fn wrong(problem: &str) -> Problem {
-    Problem::Predictions(problem.into())
 }

@@ -19,7 +19,6 @@ mod successor;
 mod tests;
 mod weights;
 
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use rayon::prelude::*;
@@ -61,7 +60,6 @@ pub struct Engine {
     successors: Successors,
     rooms: Pool,
     waves: Pool<Wave>,
-    products: AtomicU64,
 }
 
 /// Data shared by all futures of a scene: the map's keys and values, and the map under objects.
@@ -118,18 +116,12 @@ impl Engine {
             successors: Successors::new(&weights)?,
             rooms: Pool::default(),
             waves: Pool::default(),
-            products: AtomicU64::new(0),
         })
     }
 
     /// Numbers of a hidden vector.
     pub(crate) fn width(&self) -> usize {
         self.width
-    }
-
-    /// Number of multiplications so far.
-    pub(crate) fn products(&self) -> u64 {
-        self.products.load(Ordering::Relaxed)
     }
 
     /// Bytes of the packed matrices of transformer and decoder.
@@ -167,6 +159,11 @@ impl Engine {
 
     /// The hidden vectors requested by all jobs, one after another, `[wanted, C]`.
     pub fn run(&self, jobs: &mut [Job<'_>]) -> Vec<f32> {
+        self.run_counted(jobs, &mut 0)
+    }
+
+    /// As [`Self::run`]; adds the number of multiplications.
+    pub(crate) fn run_counted(&self, jobs: &mut [Job<'_>], products: &mut u64) -> Vec<f32> {
         let mut hidden = Vec::new();
         let mut rest = jobs;
         while !rest.is_empty() {
@@ -177,7 +174,7 @@ impl Engine {
                 first || rows <= WAVE
             });
             let (wave, after) = rest.split_at_mut(n.count());
-            hidden.extend(self.waves.with(|room| self.run_wave(wave, room)));
+            hidden.extend(self.waves.with(|room| self.run_wave(wave, room, products)));
             rest = after;
         }
         hidden
@@ -191,10 +188,13 @@ impl Engine {
         config: &SamplingConfig,
     ) -> Vec<Bins> {
         // Widths and lengths are always given.
-        let n_steps = STEPS.len();
-        self.count(self.decoder.products(requests.len(), 2, n_steps));
         self.decoder
-            .sample(hidden, requests, config, n_steps, &self.rooms)
+            .sample(hidden, requests, config, STEPS.len(), &self.rooms)
+    }
+
+    /// Number of multiplications of [`Self::sample`] for `n` requests.
+    pub(crate) fn products_of_samples(&self, n: usize) -> u64 {
+        self.decoder.products(n, 2, STEPS.len())
     }
 
     /// As `Engine::sample`, but only the first state, including its size; later bins are 0.
@@ -204,26 +204,29 @@ impl Engine {
         requests: &[&Request],
         config: &SamplingConfig,
     ) -> Vec<Bins> {
-        self.count(self.decoder.products(requests.len(), 0, STATE_STEPS));
         self.decoder
             .sample(hidden, requests, config, STATE_STEPS, &self.rooms)
     }
 
     /// Logits of the successors of the tokens whose hidden vectors `[N, C]` are given.
     pub fn successors(&self, hidden: &[f32]) -> Vec<Successor> {
-        let rows = hidden.len() / self.width;
-        self.count(self.successors.products(rows));
         hidden
             .chunks_exact(self.width)
             .map(|hidden| self.successors.logits(hidden))
             .collect()
     }
 
-    fn count(&self, products: u64) {
-        self.products.fetch_add(products, Ordering::Relaxed);
+    /// Number of multiplications of [`Self::successors`] for so many tokens.
+    pub(crate) fn products_of_successors(&self, tokens: usize) -> u64 {
+        self.successors.products(tokens)
     }
 
-    fn run_wave(&self, jobs: &mut [Job<'_>], Wave { x, kv }: &mut Wave) -> Vec<f32> {
+    fn run_wave(
+        &self,
+        jobs: &mut [Job<'_>],
+        Wave { x, kv }: &mut Wave,
+        products: &mut u64,
+    ) -> Vec<f32> {
         let c = self.width;
         let mut rows: Vec<JobPosition> = Vec::new();
         let mut starts = Vec::with_capacity(jobs.len());
@@ -244,16 +247,18 @@ impl Engine {
         }
         let slots: Vec<&PlacedSlot> = rows.iter().map(|&(i, at)| &jobs[i].slots[at]).collect();
         let ground = |row: usize| &jobs[rows[row].0].memory.ground;
-        self.count(self.embedder.embed(&slots, ground, &self.rooms, x)); // [R, C]
-        self.count(self.encode_local_context(jobs, &starts, x));
+        *products += self.embedder.embed(&slots, ground, &self.rooms, x); // [R, C]
+        *products += self.encode_local_context(jobs, &starts, x);
         kv.resize(2 * x.len(), 0.0); // [R, 2C]
         for (l, layer) in self.layers.iter().enumerate() {
+            *products += layer.key_value.products(x.len() / c);
             self.keys_and_values(layer, x, kv);
             write_pages(self.heads, l, jobs, &starts, kv);
             if l + 1 == self.layers.len() {
                 // Nothing after this reads but what is asked for.
                 rows = self.keep_wanted(jobs, &starts, x);
             }
+            *products += self.products_of_layer(layer, jobs, &rows);
             self.layer(l, layer, jobs, &rows, x);
         }
         for (job, start) in jobs.iter_mut().zip(starts) {
@@ -316,7 +321,6 @@ impl Engine {
     fn keys_and_values(&self, layer: &Layer, x: &[f32], kv: &mut [f32]) {
         let c = self.width;
         let rows = x.len() / c;
-        self.count(layer.key_value.products(rows));
         let step = chunk_rows(rows);
         x.par_chunks(step * c)
             .zip(kv.par_chunks_mut(2 * step * c))
@@ -340,7 +344,6 @@ impl Engine {
         x: &mut [f32],
     ) {
         let c = self.width;
-        self.count_layer(layer, jobs, rows);
         let own = |row: &JobPosition| {
             let kv_cache = &*jobs[row.0].kv_cache;
             let l = if kv_cache.layers.len() == 1 { 0 } else { l };
@@ -365,7 +368,8 @@ impl Engine {
             });
     }
 
-    fn count_layer(&self, layer: &Layer, jobs: &[Job<'_>], rows: &[JobPosition]) {
+    /// Number of multiplications of [`Self::layer`].
+    fn products_of_layer(&self, layer: &Layer, jobs: &[Job<'_>], rows: &[JobPosition]) -> u64 {
         let dense = layer.matrices().map(|panels| panels.products(rows.len()));
         let dense = dense.sum::<u64>() - layer.key_value.products(rows.len());
         let seen = |row: &JobPosition| {
@@ -373,7 +377,7 @@ impl Engine {
             (row.1 + 1 + map) as u64
         };
         let attended = rows.iter().map(seen).sum::<u64>() * 2 * self.width as u64;
-        self.count(dense + attended);
+        dense + attended
     }
 
     /// `x += gate * out(attention(query(norm(x))))`, where `keys` returns the pages that a row

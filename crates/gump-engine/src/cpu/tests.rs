@@ -42,7 +42,6 @@ fn the_engine_says_what_the_network_says() {
     let expected = hidden(&network, &[&slots], &memory).concat().concat();
     let found = all(&engine, &packed, &slots, &mut KvCache::default());
     assert!(largest_difference(&found, &expected) < 1e-4);
-    assert!(engine.products() > 0);
 }
 
 #[test]

@@ -2,6 +2,6 @@
 //! a scene.
 
 pub mod births;
-pub mod ground;
 pub mod object_spec;
 pub mod rules;
+pub mod spawn_map;

@@ -12,8 +12,8 @@ use gump_model::decoder::{Bins, STATE_STEPS, STEPS};
 use gump_scene::{AgentKind, MapGraph};
 use gump_tokenizer::{Field, QuantizedState};
 
-use crate::placement::ground::{CELLS, Cell, Entry, Ground, SLOW, goes};
 use crate::placement::object_spec::{Bounds, ObjectSpec};
+use crate::placement::spawn_map::{CELLS, Cell, Entry, SLOW, SpawnMap, goes};
 use crate::request::Guide;
 
 /// Added to length and width where room for an object is sought, metres: half a step of the grid of
@@ -39,7 +39,7 @@ pub struct Rules {
     /// Its specification.
     pub spec: ObjectSpec,
     /// Its valid positions; `None` if it may be anywhere.
-    pub ground: Option<Arc<Ground>>,
+    pub ground: Option<Arc<SpawnMap>>,
     /// The row it belongs to: whether it is ahead of (true) or behind an object, the box of that
     /// object, and the gap in metres.
     pub rows: Vec<(bool, OrientedBox, f64)>,
@@ -315,7 +315,7 @@ impl Rules {
         }
         let way = velocity.to_angle();
         let turns = self.heading().is_some_and(|b| !b.admit_angle(way, 0.1));
-        let goes = |ground: &Arc<Ground>| ground.admits(velocity);
+        let goes = |ground: &Arc<SpawnMap>| ground.admits(velocity);
         !turns && (!self.rows.is_empty() || self.ground.as_ref().is_none_or(goes))
     }
 
@@ -513,7 +513,7 @@ mod tests {
     #[test]
     fn guided_vehicles_stay_on_lanes_and_go_their_way() {
         let scenario = fixture::scenario("lane 1: -50,10 50,10\nego vehicle 0: 0,0").unwrap();
-        let ground = Ground::of_class(&scenario.map, Pose::IDENTITY, AgentKind::Vehicle);
+        let ground = SpawnMap::of_class(&scenario.map, Pose::IDENTITY, AgentKind::Vehicle);
         let rules = Rules {
             ground: Some(Arc::new(ground)),
             comes_to: None,
@@ -537,7 +537,7 @@ mod tests {
     fn who_keeps_to_a_lane_faces_its_way_exactly() {
         let scenario = fixture::scenario("lane 1: -50,0 50,1.3\nego vehicle 0: 0,0").unwrap();
         let way = 0.013_f64.atan();
-        let ground = Ground::of_class(&scenario.map, Pose::IDENTITY, AgentKind::Vehicle);
+        let ground = SpawnMap::of_class(&scenario.map, Pose::IDENTITY, AgentKind::Vehicle);
         let rules = Rules {
             ground: Some(Arc::new(ground)),
             is_guided: true,

@@ -24,7 +24,7 @@ pub(super) const KEPT: usize = PAST + 1;
 
 /// The network with packed weights.
 #[derive(Debug)]
-pub struct Engine {
+pub struct RelativeEngine {
     config: RelativeConfig,
     nodes: [Panels; 2],
     pieces: [Panels; 2],
@@ -119,7 +119,7 @@ pub struct Draw {
     pub top_p: f64,
 }
 
-impl Engine {
+impl RelativeEngine {
     /// Packs the weights.
     ///
     /// # Errors

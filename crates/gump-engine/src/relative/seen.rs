@@ -4,19 +4,19 @@ use gump_geometry::{DVec2, Pose};
 use gump_model::relative::graph::{Body, Lights, PAST, Shown, look, past_edge};
 use gump_model::relative::map::VectorMap;
 
-use crate::relative::engine::{AgentMemory, Engine, KEPT, MapMemory, Present};
+use crate::relative::engine::{AgentMemory, KEPT, MapMemory, Present, RelativeEngine};
 
 /// An agent with its observed frames.
 #[derive(Clone, Debug)]
-pub struct Seen {
+pub struct ObservedAgent {
     /// The last frames without a gap, the latest last; at least one, at most [`KEPT`].
     shown: Vec<Shown>,
     memory: AgentMemory,
 }
 
-impl Seen {
+impl ObservedAgent {
     /// An agent in its first frame, with its stated velocity, world frame, metres per second.
-    pub fn first(engine: &Engine, body: Body, pose: Pose, velocity: DVec2) -> Self {
+    pub fn first(engine: &RelativeEngine, body: Body, pose: Pose, velocity: DVec2) -> Self {
         Self {
             shown: vec![Shown::first(body, pose, velocity)],
             memory: engine.blank(),
@@ -47,12 +47,12 @@ impl Seen {
 pub fn add_presents<'a>(
     (map, memory): (&VectorMap, &'a MapMemory),
     lights: &Lights,
-    seen: impl Iterator<Item = &'a mut Seen>,
+    seen: impl Iterator<Item = &'a mut ObservedAgent>,
     t: usize,
     presents: &mut Vec<Present<'a>>,
 ) {
     let first = presents.len();
-    let seen: Vec<&mut Seen> = seen.collect();
+    let seen: Vec<&mut ObservedAgent> = seen.collect();
     let agents: Vec<Shown> = seen.iter().map(|seen| seen.now()).collect();
     presents.extend(seen.into_iter().enumerate().map(|(i, seen)| {
         let now = &agents[i];

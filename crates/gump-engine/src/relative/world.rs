@@ -9,7 +9,6 @@ mod live;
 
 use std::collections::BTreeMap;
 use std::ops::Range;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError, Weak};
 
 use gump_geometry::{DVec2, Pose, angle_difference};
@@ -21,7 +20,9 @@ use gump_model::relative::graph::{Body, Lights, Shown};
 use gump_model::relative::grid::{FIELDS, dequantize};
 use gump_model::relative::map::{Hidden, VectorMap};
 use gump_model::steps::TOKEN_DT;
-use gump_rollout::{BoxError, PredictiveSamples, ProbeConfig, Session, Start, WorldModel};
+use gump_rollout::{
+    BoxError, PredictiveSamples, ProbeConfig, Session, SessionStats, Start, WorldModel,
+};
 use gump_scene::{
     Agent, AgentId, AgentKind, AgentState, Frame, Lane, Light, LightState, MapGraph, SceneState,
     Seed,
@@ -30,11 +31,11 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::EngineError;
-use crate::relative::engine::{Draw, Engine, KEPT, MapMemory, Workspace};
+use crate::relative::engine::{Draw, KEPT, MapMemory, RelativeEngine, Workspace};
 use crate::relative::rules::{
     Driven, StopLine, kinematically_limited, obey_lights, resolve, runs_red, start,
 };
-use crate::relative::seen::{Seen, add_presents};
+use crate::relative::seen::{ObservedAgent, add_presents};
 use crate::relative::waiting::{Standing, free_to_go};
 use crate::sampling::SamplingConfig;
 
@@ -81,7 +82,7 @@ const TOGETHER: usize = 8;
 /// Separates the streams of redraws from those of fields, which are few, ...
 const REDRAW: u64 = 1 << 20;
 /// ... and those of predictive samples from both.
-const WATCH: u64 = 1 << 40;
+const SAMPLE_STREAMS: u64 = 1 << 40;
 
 /// Settings of rollouts.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -144,22 +145,10 @@ impl RelativeSampling {
 /// A trained relative network as a world model.
 #[derive(Debug)]
 pub struct RelativeWorld {
-    engine: Engine,
+    engine: RelativeEngine,
     sampling: RelativeSampling,
-    /// Steps made so far, of all sessions.
-    passes: AtomicU64,
     /// Scenes of open sessions: further sessions from the same present share them.
-    scenes: Mutex<Vec<(Laid, Weak<Scene>)>>,
-}
-
-/// The key of the scene of a start.
-#[derive(Clone, Debug, PartialEq)]
-struct Laid {
-    /// The address of the map, which stays valid as long as the scene holds it.
-    source: usize,
-    centre: DVec2,
-    ego: AgentId,
-    lights: Vec<Light>,
+    scenes: Mutex<Vec<Weak<Scene>>>,
 }
 
 impl RelativeWorld {
@@ -184,9 +173,8 @@ impl RelativeWorld {
         sampling: RelativeSampling,
     ) -> Result<Self, ModelError> {
         Ok(Self {
-            engine: Engine::new(weights, sampling.precision)?,
+            engine: RelativeEngine::new(weights, sampling.precision)?,
             sampling,
-            passes: AtomicU64::new(0),
             scenes: Mutex::default(),
         })
     }
@@ -196,35 +184,28 @@ impl RelativeWorld {
         self.sampling.temperature = temperature;
     }
 
-    /// Steps made so far, whatever the number of futures.
-    pub fn passes(&self) -> u64 {
-        self.passes.load(Ordering::Relaxed)
-    }
-
     /// The prepared map around the ego, shared with sessions from the same present.
     fn scene(&self, state: SceneState<'_>) -> Arc<Scene> {
         let (centre, lights) = Scene::place(state);
-        let laid = Laid {
-            source: Arc::as_ptr(state.map) as usize,
-            centre,
-            ego: state.ego,
-            lights,
-        };
         let known = || self.scenes.lock().unwrap_or_else(PoisonError::into_inner);
-        let same = |(key, scene): &(Laid, Weak<Scene>)| {
+        let same = |scene: &Weak<Scene>| {
             let scene = scene.upgrade()?;
-            (*key == laid).then_some(scene)
+            let is_same = Arc::ptr_eq(&scene.source, state.map)
+                && scene.centre == centre
+                && scene.ego == state.ego
+                && scene.lights == lights;
+            is_same.then_some(scene)
         };
         if let Some(scene) = known().iter().find_map(same) {
             return scene;
         }
         let source = Arc::clone(state.map);
-        let here = (state.ego, &laid.lights[..]);
+        let here = (state.ego, &lights[..]);
         let scene = Scene::around(&self.engine, source, centre, here, &self.sampling);
         let scene = Arc::new(scene);
         let mut scenes = known();
-        scenes.retain(|(_, scene)| scene.strong_count() > 0);
-        scenes.push((laid, Arc::downgrade(&scene)));
+        scenes.retain(|scene| scene.strong_count() > 0);
+        scenes.push(Arc::downgrade(&scene));
         scene
     }
 
@@ -296,6 +277,8 @@ pub(super) struct Scene {
     pub lane_map: LaneMap,
     lines: Vec<StopLine>,
     ego: AgentId,
+    /// The lights that it may show.
+    lights: Vec<Light>,
 }
 
 impl Scene {
@@ -309,7 +292,7 @@ impl Scene {
     }
 
     fn around(
-        engine: &Engine,
+        engine: &RelativeEngine,
         source: Arc<MapGraph>,
         centre: DVec2,
         (ego, lights): (AgentId, &[Light]),
@@ -330,6 +313,7 @@ impl Scene {
             source,
             centre,
             ego,
+            lights: lights.to_vec(),
         }
     }
 }
@@ -338,7 +322,7 @@ impl Scene {
 #[derive(Clone, Debug)]
 struct Member {
     agent: Agent,
-    seen: Seen,
+    seen: ObservedAgent,
     /// Time that it has stood, seconds, as far as it was observed.
     waited: f64,
     /// Whether it was faster than [`DRIVES`] in a frame since.
@@ -370,7 +354,7 @@ struct Future {
 impl Future {
     /// The present of a scene, its history read.
     fn begin(
-        engine: &Engine,
+        engine: &RelativeEngine,
         scene: &Arc<Scene>,
         state: SceneState<'_>,
     ) -> Result<Self, EngineError> {
@@ -410,7 +394,7 @@ impl Future {
     }
 
     /// Reads a frame of history: the states of the present agents that are in it.
-    fn see(&mut self, engine: &Engine, frame: &Frame, predicted: &[Agent]) {
+    fn see(&mut self, engine: &RelativeEngine, frame: &Frame, predicted: &[Agent]) {
         let mut before: BTreeMap<AgentId, Member> = std::mem::take(&mut self.members)
             .into_iter()
             .map(|member| (member.agent.id, member))
@@ -429,13 +413,13 @@ impl Future {
     }
 
     /// Lets the network read the present.
-    fn read(&mut self, engine: &Engine, room: &mut Workspace) {
+    fn read(&mut self, engine: &RelativeEngine, room: &mut Workspace) {
         Self::read_all(std::slice::from_mut(self), engine, room);
     }
 
     /// Lets the network read the present of several futures at once: its weights are then fetched
     /// once for all of them.
-    fn read_all(futures: &mut [Self], engine: &Engine, room: &mut Workspace) {
+    fn read_all(futures: &mut [Self], engine: &RelativeEngine, room: &mut Workspace) {
         let mut presents = Vec::new();
         for future in &mut *futures {
             let (scene, lights) = (&future.scene, &future.shown_lights);
@@ -457,13 +441,13 @@ impl Future {
     }
 
     /// Lets it read the present again, after others have come or gone.
-    fn reread(&mut self, engine: &Engine, room: &mut Workspace) {
+    fn reread(&mut self, engine: &RelativeEngine, room: &mut Workspace) {
         self.frames -= 1;
         self.read(engine, room);
     }
 
     /// Lays the map out anew once the ego has come far from the middle of what is laid out.
-    fn follow(&mut self, engine: &Engine, sampling: &RelativeSampling) {
+    fn follow(&mut self, engine: &RelativeEngine, sampling: &RelativeSampling) {
         let scene = &self.scene;
         let ego = self.members.iter().find(|m| m.agent.id == scene.ego);
         let Some(ego) = ego.map(|member| member.now().pose.position) else {
@@ -480,7 +464,7 @@ impl Future {
     /// weights are fetched once for all of them.
     fn step_all(
         futures: &mut [Self],
-        engine: &Engine,
+        engine: &RelativeEngine,
         sampling: &RelativeSampling,
         egos: Option<&[AgentState]>,
         room: &mut Workspace,
@@ -505,7 +489,7 @@ impl Future {
     /// Returns the moves of all agents in the next half second, given the state of a driven ego.
     fn decide(
         &self,
-        engine: &Engine,
+        engine: &RelativeEngine,
         sampling: &RelativeSampling,
         ego: Option<AgentState>,
         room: &mut Workspace,
@@ -587,7 +571,7 @@ impl Future {
     /// the rules.
     fn moves(
         &self,
-        engine: &Engine,
+        engine: &RelativeEngine,
         sampling: &RelativeSampling,
         (streams, drawn): (&[Seed], &[[u16; FIELDS]]),
         ego: Option<AgentState>,
@@ -653,7 +637,7 @@ impl Future {
     /// Returns draws of the next states of all agents but the driven one, from separate streams.
     fn predictive_samples(
         &self,
-        engine: &Engine,
+        engine: &RelativeEngine,
         sampling: &RelativeSampling,
         (draws, future, step): (Range<u64>, usize, usize),
         driven: Option<AgentId>,
@@ -663,7 +647,8 @@ impl Future {
         let seed = self.seed.fork(self.frames as u64);
         let draws: Vec<_> = draws
             .map(|k| {
-                let stream = |member: &Member| seed.fork(member.agent.id.0 as u64).fork(WATCH + k);
+                let stream =
+                    |member: &Member| seed.fork(member.agent.id.0 as u64).fork(SAMPLE_STREAMS + k);
                 let streams: Vec<Seed> = self.members.iter().map(stream).collect();
                 engine.decide(&self.hidden, &streams, draw, &mut room)
             })
@@ -715,7 +700,7 @@ impl Future {
     /// Lets agents go and others come, whom the network sees for the first time where they are now.
     fn exchange(
         &mut self,
-        engine: &Engine,
+        engine: &RelativeEngine,
         leave: &[AgentId],
         come: &[Agent],
         room: &mut Workspace,
@@ -744,11 +729,11 @@ impl Future {
 
 impl Member {
     /// An agent in its first frame.
-    fn first(engine: &Engine, agent: &Agent) -> Self {
+    fn first(engine: &RelativeEngine, agent: &Agent) -> Self {
         let state = agent.state;
         Self {
             agent: *agent,
-            seen: Seen::first(engine, body(agent), state.pose, state.velocity),
+            seen: ObservedAgent::first(engine, body(agent), state.pose, state.velocity),
             waited: 0.0,
             has_driven: state.speed() > DRIVES,
             could_go: false,
@@ -845,7 +830,6 @@ impl Session for RelativeSession<'_> {
             self.samples.extend(seen);
         }
         self.step += 1;
-        self.world.passes.fetch_add(1, Ordering::Relaxed);
         // Enough groups that all threads end at about the same time.
         let threads = rayon::current_num_threads();
         let most = self.futures.len().div_ceil(4 * threads).clamp(1, TOGETHER);
@@ -873,6 +857,14 @@ impl Session for RelativeSession<'_> {
 
     fn take_predictive_samples(&mut self) -> Vec<PredictiveSamples> {
         std::mem::take(&mut self.samples)
+    }
+
+    /// A pass is a step, whatever the number of futures.
+    fn stats(&self) -> SessionStats {
+        SessionStats {
+            passes: self.step as u64,
+            ..SessionStats::default()
+        }
     }
 
     fn show(&mut self, future: usize, lights: &[Light]) -> bool {

@@ -14,7 +14,8 @@ use gump_model::placed_slot::PlacedSlot;
 use gump_scene::{Frame, LaneId, LightState};
 use gump_tokenizer::{Slot, TokenLight};
 
-use crate::cpu::{Engine, KvCache};
+use crate::counters::CountedEngine;
+use crate::cpu::KvCache;
 use crate::nucleus::uniform;
 use crate::partial_ar::Window;
 use crate::placement::births::pick;
@@ -57,7 +58,7 @@ impl TransformerSession<'_> {
     /// Draws the lights of the next frames.
     pub(super) fn draw_lights(
         &mut self,
-        engine: &Engine,
+        engine: &CountedEngine<'_>,
         windows: &mut [Window],
         placed: &mut [Vec<PlacedSlot>],
         kv_caches: &mut [KvCache],

@@ -1,8 +1,9 @@
 //! Stored results that are incomplete, damaged, or of different evaluations.
 
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 
-use crate::results::Header;
+use crate::results::{CHECKSUMS, Header};
 use crate::shard::Shard;
 
 /// Why stored results cannot be written, read or merged.
@@ -51,6 +52,47 @@ pub enum ResultsError {
         /// Another one.
         second: PathBuf,
     },
+    /// A folder already has another shard of the evaluation that is to be written to it.
+    #[error(
+        "expected a folder for shard {requested} alone, found shard {stored} of the same \
+         evaluation in {}: give every shard its own --out",
+        path.display()
+    )]
+    OtherShard {
+        /// The file of its results.
+        path: PathBuf,
+        /// The shard whose results it has.
+        stored: Shard,
+        /// The shard that was to be written.
+        requested: Shard,
+    },
+    /// A scenario is in a shard twice.
+    #[error("expected every scenario once, found scenario {index} twice in {}", folder.display())]
+    RepeatedScenario {
+        /// Position among all scenarios.
+        index: usize,
+        /// Folder of the shard.
+        folder: PathBuf,
+    },
+    /// Shards have the same settings, but read other scenarios or weights under the same names.
+    #[error(
+        "expected shards that read the same, found {input} of checksum {expected} in {} but of \
+         {found} in {}",
+        expected_in.display(),
+        found_in.display()
+    )]
+    DifferentInputs {
+        /// What differs: "scenario_ids", or a world with its weights.
+        input: String,
+        /// Its checksum in the first folder that has one.
+        expected: String,
+        /// That folder.
+        expected_in: PathBuf,
+        /// Its checksum in another folder.
+        found: String,
+        /// That folder.
+        found_in: PathBuf,
+    },
     /// A scenario belongs to another shard than that of its file.
     #[error("scenario {index} is not of shard {shard}: {}", folder.display())]
     ForeignScenario {
@@ -71,15 +113,10 @@ pub enum ResultsError {
     },
     /// Two folders have results of different evaluations.
     #[error(
-        "expected shards of one evaluation, found {} {} of {} in {} but {} {} of {} in {}",
-        expected.benchmark,
-        expected.settings,
-        expected.shard.n,
+        "expected shards of one evaluation, but {} and {} differ: {}",
         expected_in.display(),
-        found.benchmark,
-        found.settings,
-        found.shard.n,
-        found_in.display()
+        found_in.display(),
+        differences(expected, found)
     )]
     DifferentEvaluations {
         /// The evaluation of the first folder.
@@ -92,7 +129,7 @@ pub enum ResultsError {
         found_in: PathBuf,
     },
     /// A count is of a measure or a class that is not known.
-    #[error("expected a known measure and class in the ledger, found {measure} of {class}")]
+    #[error("expected a known measure and class in the results, found {measure} of {class}")]
     UnknownCount {
         /// Name of the measure.
         measure: String,
@@ -127,4 +164,23 @@ pub enum ResultsError {
         /// The most frequent reason.
         reason: Option<String>,
     },
+}
+
+/// What keeps two headers from being of one evaluation: names, and the values of both.
+fn differences(a: &Header, b: &Header) -> String {
+    let value = |header: &Header, name: &str| {
+        let value = header.settings.get(name);
+        value.map_or_else(|| "nothing".to_owned(), ToString::to_string)
+    };
+    let names: BTreeSet<&String> = a.settings.keys().chain(b.settings.keys()).collect();
+    let settings = names.into_iter().filter(|name| *name != CHECKSUMS);
+    let settings = settings.map(|name| (name.as_str(), value(a, name), value(b, name)));
+    let [n, other_n] = [a, b].map(|header| header.shard.n.to_string());
+    let all = [
+        ("benchmark", a.benchmark.clone(), b.benchmark.clone()),
+        ("number of shards", n, other_n),
+    ];
+    let differing = all.into_iter().chain(settings).filter(|(_, a, b)| a != b);
+    let differing = differing.map(|(name, a, b)| format!("{name} {a} and {b}"));
+    differing.collect::<Vec<_>>().join("; ")
 }

@@ -76,7 +76,7 @@ pub fn n_numbers(config: &ModelConfig) -> usize {
 
 /// An object as the window shows it.
 #[derive(Clone, Copy, Debug)]
-pub struct Seen {
+pub struct ObservedObject {
     key: Key,
     pose: Pose,
     velocity: DVec2,
@@ -85,7 +85,7 @@ pub struct Seen {
     has_size: bool,
 }
 
-impl Seen {
+impl ObservedObject {
     fn new(key: Key, state: QuantizedState, exact: Option<Exact>) -> Self {
         if let Some(exact) = exact {
             let [length, width] = exact.size();
@@ -120,7 +120,8 @@ pub fn encode_local_context(
     let mut seen = Vec::new();
     let mut frame = None;
     // The last frame that showed anybody before the present one, and the present one.
-    let (mut others, mut now): (Vec<Seen>, Vec<Seen>) = (Vec::new(), Vec::new());
+    let (mut others, mut now): (Vec<ObservedObject>, Vec<ObservedObject>) =
+        (Vec::new(), Vec::new());
     let mut before: Vec<Option<Pose>> = Vec::new();
     let mut lights: Vec<TokenLight> = Vec::new();
     for (i, placed) in slots.iter().enumerate() {
@@ -139,7 +140,7 @@ pub fn encode_local_context(
         match (placed.slot, placed.key) {
             (Slot::Light(light), _) => lights.push(light),
             (Slot::Value(state), Some(key)) => {
-                now.push(Seen::new(key, state, placed.exact));
+                now.push(ObservedObject::new(key, state, placed.exact));
             }
             (Slot::Key(key), _) if i >= from => {
                 if let Some(last) = placed.last {
@@ -149,7 +150,10 @@ pub fn encode_local_context(
                         lights: &lights,
                     };
                     let earlier = before.get(usize::from(key.id)).copied().flatten();
-                    seen.push((i, scene.of(Seen::new(key, last, placed.exact), earlier)));
+                    seen.push((
+                        i,
+                        scene.of(ObservedObject::new(key, last, placed.exact), earlier),
+                    ));
                 }
             }
             _ => {}
@@ -161,12 +165,12 @@ pub fn encode_local_context(
 /// Surroundings of the objects of a frame.
 struct Around<'a> {
     lane_map: &'a LaneMap,
-    others: &'a [Seen],
+    others: &'a [ObservedObject],
     lights: &'a [TokenLight],
 }
 
 impl Around<'_> {
-    fn of(&self, own: Seen, earlier: Option<Pose>) -> LocalContext {
+    fn of(&self, own: ObservedObject, earlier: Option<Pose>) -> LocalContext {
         let mut all = [0.0; N_PLAIN + N_MARKS];
         let (numbers, marks) = all.split_at_mut(N_PLAIN);
         let mut writer = Writer(numbers);
@@ -198,7 +202,13 @@ impl Around<'_> {
     }
 
     /// Sets the marks of unknown inputs.
-    fn mark(&self, own: &Seen, paths: &[lane_map::Path], near: &[&Seen], marks: &mut [f32]) {
+    fn mark(
+        &self,
+        own: &ObservedObject,
+        paths: &[lane_map::Path],
+        near: &[&ObservedObject],
+        marks: &mut [f32],
+    ) {
         let mark = |is_unknown: bool| f64::from(u8::from(is_unknown));
         let mut writer = Writer(marks);
         for i in 0..N_PATHS {
@@ -216,7 +226,7 @@ impl Around<'_> {
         }
     }
 
-    fn path(&self, path: &[u32], own: &Seen, own_from_scene: Pose, out: &mut [f32]) {
+    fn path(&self, path: &[u32], own: &ObservedObject, own_from_scene: Pose, out: &mut [f32]) {
         let mut writer = Writer(out);
         writer.put([1.0]);
         for shown in SHOWN {
@@ -284,7 +294,7 @@ impl Around<'_> {
     }
 
     /// The first object on a path, and the step of the path it is at.
-    fn ahead_on(&self, path: &[u32], own: &Seen) -> Option<(usize, &Seen)> {
+    fn ahead_on(&self, path: &[u32], own: &ObservedObject) -> Option<(usize, &ObservedObject)> {
         let reach = PATH_POINTS as f64 * LANE_STEP_M + 10.0;
         let near = self.others.iter().filter(|other| {
             other.key.id != own.key.id && other.pose.position.distance(own.pose.position) < reach
@@ -358,8 +368,8 @@ impl Around<'_> {
     }
 
     /// The nearest of the others, the nearest first.
-    fn nearest(&self, own: &Seen) -> Vec<&Seen> {
-        let mut near: Vec<(f64, &Seen)> = self
+    fn nearest(&self, own: &ObservedObject) -> Vec<&ObservedObject> {
+        let mut near: Vec<(f64, &ObservedObject)> = self
             .others
             .iter()
             .filter(|other| other.key.id != own.key.id)
@@ -377,7 +387,7 @@ impl Around<'_> {
     }
 }
 
-fn neighbours(near: &[&Seen], own_from_scene: Pose, writer: &mut Writer<'_>) {
+fn neighbours(near: &[&ObservedObject], own_from_scene: Pose, writer: &mut Writer<'_>) {
     for other in near {
         let pose = own_from_scene * other.pose;
         let direction = pose.direction();
@@ -399,7 +409,7 @@ fn neighbours(near: &[&Seen], own_from_scene: Pose, writer: &mut Writer<'_>) {
     }
 }
 
-fn own_motion(out: &mut [f32], own: &Seen, earlier: Option<Pose>) {
+fn own_motion(out: &mut [f32], own: &ObservedObject, earlier: Option<Pose>) {
     let mut writer = Writer(out);
     let own_from_scene = own.pose.inverse();
     let velocity = own_from_scene.rotate(own.velocity);

@@ -39,15 +39,25 @@ impl RelativeConfig {
     /// # Errors
     /// [`ModelError::Config`] naming the first contradiction.
     pub fn validate(&self) -> Result<(), ModelError> {
-        let fail = |what: String| Err(ModelError::Config(what));
+        let fail = |key: &'static str, reason: String| Err(ModelError::Config { key, reason });
         if self.heads == 0 || !self.width.is_multiple_of(self.heads) {
-            return fail(format!(
-                "width {} is not a multiple of {} heads",
-                self.width, self.heads
-            ));
+            return fail(
+                "heads",
+                format!(
+                    "width {} is not a multiple of {} heads",
+                    self.width, self.heads
+                ),
+            );
         }
-        if self.layers == 0 || self.edge_width == 0 || self.edge_hidden == 0 {
-            return fail("layers, edge_width and edge_hidden must be at least 1".into());
+        for (key, value) in [
+            ("layers", self.layers),
+            ("edge_width", self.edge_width),
+            ("edge_hidden", self.edge_hidden),
+        ] {
+            if value == 0 {
+                let reason = "layers, edge_width and edge_hidden must be at least 1";
+                return fail(key, reason.into());
+            }
         }
         Ok(())
     }

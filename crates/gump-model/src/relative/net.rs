@@ -190,9 +190,9 @@ impl RelativeNetwork {
         let norm = LayerNorm::new(&mut root, "norm", c)?;
         let decoder = MoveDecoder::new(root.part("decoder"), c)?;
         if let Some(name) = parameters.unused().first() {
-            return Err(ModelError::Config(format!(
-                "the checkpoint's tensor \"{name}\" has no place in it"
-            )));
+            return Err(ModelError::UnusedTensor {
+                name: name.to_string(),
+            });
         }
         Ok(Self {
             config,
@@ -218,8 +218,10 @@ impl RelativeNetwork {
     ) -> std::result::Result<Self, ModelError> {
         let now = self.config.layers;
         if layers < now {
-            let wrong = format!("a network of {now} layers cannot go on with {layers}");
-            return Err(ModelError::Config(wrong));
+            return Err(ModelError::Config {
+                key: "layers",
+                reason: format!("a network of {now} layers cannot go on with {layers}"),
+            });
         }
         let config = RelativeConfig {
             layers,

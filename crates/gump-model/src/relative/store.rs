@@ -57,7 +57,7 @@ pub fn header(
     config: &RelativeConfig,
 ) -> Result<std::collections::BTreeMap<String, String>, ModelError> {
     let mut header = checkpoint::header(&crate::ModelConfig::tiny())?;
-    let config = serde_json::to_string(config).map_err(|e| ModelError::Config(e.to_string()))?;
+    let config = serde_json::to_string(config).map_err(ModelError::Json)?;
     header.insert("config".into(), config);
     header.insert(ARCHITECTURE.0.into(), ARCHITECTURE.1.into());
     Ok(header)

@@ -6,8 +6,8 @@ use safetensors::SafeTensors;
 use safetensors::tensor::Dtype;
 
 use super::RelativeConfig;
-use crate::ModelError;
 use crate::prefixes::PREFIXES;
+use crate::{ModelError, WeightsError};
 
 /// The parameters of a trained relative network by name, row-major f32, with its shape.
 ///
@@ -24,9 +24,8 @@ impl RelativeWeights {
     /// # Errors
     /// [`ModelError::Weights`] for bytes that are not a checkpoint, or one of another network.
     pub fn read(bytes: &[u8]) -> Result<Self, ModelError> {
-        let fail = |what: String| ModelError::Weights(what);
-        let (_, header) = SafeTensors::read_metadata(bytes)
-            .map_err(|error| fail(format!("expected a safetensors file ({error})")))?;
+        let (_, header) =
+            SafeTensors::read_metadata(bytes).map_err(WeightsError::NotSafetensors)?;
         let entry = |key: &str| {
             header
                 .metadata()
@@ -34,14 +33,13 @@ impl RelativeWeights {
                 .and_then(|entries| entries.get(key))
         };
         if entry("architecture").map(String::as_str) != Some("relative") {
-            return Err(fail("expected weights of the relative network".into()));
+            return Err(WeightsError::OtherNetwork.into());
         }
-        let text = entry("config").ok_or_else(|| fail("the header has no \"config\"".into()))?;
-        let config: RelativeConfig = serde_json::from_str(text)
-            .map_err(|error| fail(format!("its configuration is not valid ({error})")))?;
+        let text = entry("config").ok_or(WeightsError::NoConfig)?;
+        let config: RelativeConfig =
+            serde_json::from_str(text).map_err(WeightsError::InvalidConfig)?;
         config.validate()?;
-        let file = SafeTensors::deserialize(bytes)
-            .map_err(|error| fail(format!("damaged weights ({error})")))?;
+        let file = SafeTensors::deserialize(bytes).map_err(WeightsError::Damaged)?;
         let mut numbers = BTreeMap::new();
         for (name, view) in file.tensors() {
             if PREFIXES.iter().any(|prefix| name.starts_with(prefix)) {
@@ -61,11 +59,7 @@ impl RelativeWeights {
                     .iter()
                     .map(|b| half::f16::from_le_bytes(*b).to_f32())
                     .collect(),
-                other => {
-                    return Err(fail(format!(
-                        "tensor \"{name}\" has type {other:?}, expected F16 or F32"
-                    )));
-                }
+                found => return Err(WeightsError::TensorType { name, found }.into()),
             };
             numbers.insert(name, flat);
         }

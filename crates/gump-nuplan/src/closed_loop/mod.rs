@@ -19,7 +19,7 @@ pub use controller::{Controller, Tracking};
 pub use driver::{Driver, PlannerInitialization, PlannerInput};
 pub use recording::Recording;
 pub use roadblocks::derive_roadblocks;
-pub use traffic::{Imagined, Others, Replayed, Step, Traffic};
+pub use traffic::{ImaginedTraffic, Others, Replayed, Step, Traffic};
 
 use gump_scene::{EgoState, Frame, Rollout, SceneState};
 

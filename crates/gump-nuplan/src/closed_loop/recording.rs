@@ -4,7 +4,7 @@ use gump_geometry::{Pose, angle_difference};
 use gump_scene::{Agent, EgoState, Scenario, VehicleParameters};
 
 use super::PlannerInitialization;
-use gump_rollout::RolloutError;
+use gump_rollout::{RecordingDefect, RolloutError};
 
 /// A recorded drive: traffic, and the ego at its rear axle in every frame.
 #[derive(Clone, Debug)]
@@ -27,15 +27,12 @@ impl Recording {
         vehicle: VehicleParameters,
         goal: Option<Pose>,
     ) -> Result<Self, RolloutError> {
-        let wrong = |what: String| Err(RolloutError::Recording(what));
         if ego.len() != scenario.log.len() {
             let (frames, states) = (scenario.log.len(), ego.len());
-            return wrong(format!(
-                "has {frames} frames but {states} states of the ego"
-            ));
+            return Err(RecordingDefect::StateCount { frames, states }.into());
         }
         if let Some(i) = ego.windows(2).position(|p| p[1].time_us <= p[0].time_us) {
-            return wrong(format!("frame {} is not later than the one before", i + 1));
+            return Err(RecordingDefect::TimeOrder { frame: i + 1 }.into());
         }
         if !ego.iter().all(EgoState::is_finite) {
             return Err(RolloutError::NotFinite {
@@ -61,9 +58,7 @@ impl Recording {
     pub fn of_boxes(mut scenario: Scenario) -> Result<Self, RolloutError> {
         let id = scenario.ego;
         let Some(car) = scenario.log[scenario.now].agent(id).copied() else {
-            return Err(RolloutError::Recording(format!(
-                "lacks its ego (agent {id}) now"
-            )));
+            return Err(RecordingDefect::NoEgo { ego: id }.into());
         };
         let has_ego = |frame: &gump_scene::Frame| frame.agent(id).is_some();
         let before = scenario.log[..scenario.now]
@@ -135,8 +130,7 @@ impl Recording {
         let n = requested.min(self.scenario.future().len());
         if n < 2 {
             let frames = self.scenario.future().len();
-            let what = format!("has {frames} frames after the present, expected two or more");
-            return Err(RolloutError::Recording(what));
+            return Err(RecordingDefect::TooShort { frames }.into());
         }
         Ok(n)
     }

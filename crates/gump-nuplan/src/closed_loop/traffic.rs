@@ -96,7 +96,7 @@ fn all_but(ego: gump_scene::AgentId, frame: &Frame) -> Others {
 /// straight to their next positions. Agents that it drops stand still. Lights are those of the log.
 ///
 /// Source: the released observation class of the GUMP paper, which does so at every iteration.
-pub struct Imagined<'a> {
+pub struct ImaginedTraffic<'a> {
     world: &'a dyn WorldModel,
     seed: Seed,
     knot: Option<Knot>,
@@ -109,7 +109,7 @@ struct Knot {
     to: Frame,
 }
 
-impl<'a> Imagined<'a> {
+impl<'a> ImaginedTraffic<'a> {
     /// Takes the world and the seed of its futures.
     pub fn new(world: &'a dyn WorldModel, seed: Seed) -> Self {
         Self {
@@ -168,7 +168,7 @@ fn advance(mut session: Box<dyn Session + '_>, ego: &AgentState) -> Result<Frame
     })
 }
 
-impl Traffic for Imagined<'_> {
+impl Traffic for ImaginedTraffic<'_> {
     fn name(&self) -> &str {
         self.world.name()
     }

@@ -83,7 +83,7 @@ pub use open_loop::{HorizonError, OpenLoop, OpenLoopConfig, expert_errors, open_
 pub use paper::{MEAN_PROGRESS, RlEpisode, RlScore};
 pub use progress::{ExpertProgress, expert_progress};
 pub use savgol::SavitzkyGolay;
-pub use scoring::{Aggregate, AggregateRow, MetricScores, ScenarioScores, Scoring};
+pub use scoring::{AggregateRow, AggregateScores, MetricScores, ScenarioScores, Scoring};
 pub use speed_limit::{MAX_OVERSPEED, SpeedLimit, speed_limit};
 pub use statistics::Statistics;
 pub use time_to_collision::{

@@ -105,7 +105,7 @@ impl Scoring {
     /// Scores many scenarios, per type and in total.
     ///
     /// Scenarios that failed to run are not included: report them beside the table.
-    pub fn aggregate(&self, scenarios: &[ScenarioScores]) -> Aggregate {
+    pub fn aggregate(&self, scenarios: &[ScenarioScores]) -> AggregateScores {
         let mut by_kind: BTreeMap<&str, Vec<(f64, &MetricScores)>> = BTreeMap::new();
         let mut scores = Vec::with_capacity(scenarios.len());
         for scenario in scenarios {
@@ -119,7 +119,7 @@ impl Scoring {
             .map(|(kind, members)| (kind.to_owned(), AggregateRow::of_kind(&members)))
             .collect();
         let total = AggregateRow::of_all(kinds.values());
-        Aggregate {
+        AggregateScores {
             scores,
             kinds,
             total,
@@ -138,7 +138,7 @@ pub struct ScenarioScores {
 
 /// A table of scenarios: one row per type and one for all.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Aggregate {
+pub struct AggregateScores {
     /// Score of each scenario, in the order given.
     pub scores: Vec<f64>,
     /// By type: mean score and **sums** of the metrics, as nuPlan reports them.

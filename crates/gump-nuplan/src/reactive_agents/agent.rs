@@ -489,7 +489,7 @@ mod tests {
         let recording = busy();
         let mut traffic = NuplanIdm::default();
         traffic.begin(&recording).unwrap();
-        assert!(traffic.n_vehicles() > 20);
+        assert!(traffic.vehicles.len() > 20);
         let scene = recording.scenario().present();
         let (mut led, mut touching, mut free) = (0, 0, 0);
         for iteration in 0..80 {

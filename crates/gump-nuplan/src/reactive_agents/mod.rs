@@ -89,11 +89,6 @@ impl NuplanIdm {
         })
     }
 
-    /// Vehicles that are still present.
-    pub fn n_vehicles(&self) -> usize {
-        self.vehicles.len()
-    }
-
     /// The vehicles, followed by the agents of `logged` that are replayed.
     fn others(&self, logged: &Frame) -> Others {
         let replayed = logged.agents().iter().filter(|agent| is_replayed(agent));

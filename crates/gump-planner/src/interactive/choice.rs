@@ -66,7 +66,8 @@ impl CandidateScore {
     }
 
     /// True if some gate is closed in every future, so that the candidate has no value.
-    pub fn is_hopeless(&self) -> bool {
+    #[cfg(test)]
+    pub(crate) fn is_hopeless(&self) -> bool {
         let closed = |score: &Score| score.gates.iter().any(|gate| gate.factor == 0.0);
         self.futures.iter().all(closed)
     }

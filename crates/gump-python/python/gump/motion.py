@@ -77,14 +77,14 @@ class Tally:
         confidence = _arrays.numbers(confidence, "confidence", np.float64)
         if joint and confidence.ndim == 1:
             confidence = confidence[None]
-        told = self._tally.add(
+        values = self._tally.add(
             scenario,
             _arrays.ids(agent_id),
             _arrays.numbers(paths, "paths", np.float64),
             confidence,
             joint,
         )
-        return [_prediction(one) for one in told]
+        return [_prediction(one) for one in values]
 
     def merge(self, other: "Tally") -> None:
         """Adds the measurements of another tally."""
@@ -103,6 +103,6 @@ def score(
     return Tally().add(scenario, agent_id, paths, confidence, joint)
 
 
-def _prediction(told: Dict[str, Any]) -> PredictionScore:
-    told["horizons"] = [Horizon(**horizon) for horizon in told["horizons"]]
-    return PredictionScore(**told)
+def _prediction(values: Dict[str, Any]) -> PredictionScore:
+    values["horizons"] = [Horizon(**horizon) for horizon in values["horizons"]]
+    return PredictionScore(**values)

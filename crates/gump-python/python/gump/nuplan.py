@@ -201,7 +201,7 @@ def simulate(
     name = getattr(planner, "_gump_planner", planner)
     if imagination is None:
         imagination = getattr(planner, "imagination", None)
-    told = _native.nuplan_simulate(
+    values = _native.nuplan_simulate(
         _scenario(scenario),
         name if isinstance(name, str) else _Bridge(planner),
         world._world,
@@ -210,7 +210,7 @@ def simulate(
         controller == "perfect",
         seed,
     )
-    return Simulation(**told)
+    return Simulation(**values)
 
 
 def score(
@@ -236,14 +236,14 @@ def score(
         states = np.ascontiguousarray(_with_motion(times * 1e-6, states)[:, 1:])
     if (agent_id is None) != (others is None):
         raise ValueError("agent_id, others: expected both or neither, found one")
-    told = _native.nuplan_score(
+    values = _native.nuplan_score(
         _scenario(scenario),
         times,
         states,
         None if agent_id is None else _arrays.ids(agent_id),
         _arrays.optional(others, "others", np.float64),
     )
-    return Score(**told)
+    return Score(**values)
 
 
 class _Bridge:
@@ -260,23 +260,23 @@ class _Bridge:
         self._egos: Deque[EgoState] = deque(maxlen=_BUFFER)
         self._observations: Deque[Observation] = deque(maxlen=_BUFFER)
 
-    def initialize(self, told: Dict[str, Any]) -> None:
-        told["vehicle"] = Vehicle(**told["vehicle"])
+    def initialize(self, values: Dict[str, Any]) -> None:
+        values["vehicle"] = Vehicle(**values["vehicle"])
         self._egos.clear()
         self._observations.clear()
         try:
-            self._planner.initialize(PlannerInitialization(**told))
+            self._planner.initialize(PlannerInitialization(**values))
         except Exception as error:
             raise PlannerError(f"{self._name()} raised {_sentence(error)} in initialize") from error
 
-    def plan(self, told: Dict[str, Any]) -> np.ndarray:
-        if told["before"] is not None:
-            egos, observations = told["before"]
+    def plan(self, values: Dict[str, Any]) -> np.ndarray:
+        if values["before"] is not None:
+            egos, observations = values["before"]
             self._egos.extend(EgoState(time_us, *row) for time_us, row in egos)
             self._observations.extend(Observation(**one) for one in observations)
-        self._egos.append(EgoState(told["time_us"], *told["ego"]))
-        self._observations.append(Observation(**told["observed"]))
-        iteration = Iteration(told["iteration"], told["time_us"])
+        self._egos.append(EgoState(values["time_us"], *values["ego"]))
+        self._observations.append(Observation(**values["observed"]))
+        iteration = Iteration(values["iteration"], values["time_us"])
         history = History(list(self._egos), list(self._observations))
         try:
             plan = self._planner.compute_planner_trajectory(PlannerInput(iteration, history))

@@ -24,7 +24,7 @@ from .worlds import World
 class Sb3VecEnv(VecEnv):
     """Many episodes of driving side by side; a row that ends begins its next episode at once.
 
-    Arguments are those of `gump.VectorEnv`. What is told of an episode that ended is in its row's info:
+    Arguments are those of `gump.VectorEnv`. What is known of an episode that ended is in its row's info:
     `terminal_observation`, `TimeLimit.truncated`, `episode`, and beside them what `VectorEnv` tells.
     """
 
@@ -52,12 +52,12 @@ class Sb3VecEnv(VecEnv):
 
     def step_wait(self) -> Any:
         """What came of them."""
-        observations, rewards, terminated, truncated, told = self.env.step(self._actions)
+        observations, rewards, terminated, truncated, extras = self.env.step(self._actions)
         infos: List[Any] = [{} for _ in range(self.num_envs)]
         for row in np.flatnonzero(terminated | truncated):
             info = infos[row]
-            info.update({key: told["final_info"][key][row].item() for key in _KINDS})
-            info["terminal_observation"] = told["final_obs"][row]
+            info.update({key: extras["final_info"][key][row].item() for key in _KINDS})
+            info["terminal_observation"] = extras["final_obs"][row]
             info["TimeLimit.truncated"] = bool(truncated[row])
             info["episode"] = {"r": info["return"], "l": info["steps"]}
         return observations, rewards.astype(np.float32), terminated | truncated, infos

@@ -122,8 +122,8 @@ class VectorEnv(_VectorBase):
 
     def step(self, actions: Any) -> Tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Dict[str, Any]]:
         """One action per row: observations, rewards float64, terminated, truncated, infos."""
-        told = self._env.step(_arrays.numbers(actions, "actions"))
-        observations, rewards, terminated, truncated, ended = told
+        results = self._env.step(_arrays.numbers(actions, "actions"))
+        observations, rewards, terminated, truncated, ended = results
         return observations, rewards.astype(np.float64), terminated, truncated, self._infos(ended)
 
     def expert_actions(self) -> np.ndarray:

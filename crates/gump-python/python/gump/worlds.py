@@ -96,7 +96,7 @@ class World:
         seed: int = 0,
         hold: bool = True,
     ) -> np.ndarray:
-        """Imagines what comes after the present; the world drives the ego, too, and is not told its
+        """Imagines what comes after the present; the world drives the ego, too, and is not given its
         route.
 
         Gives float64 [R, A, T, 4] in steps of `scenario.dt`: x, y, z, heading of the agents of

@@ -40,7 +40,7 @@ class AgentRealism(NamedTuple):
     """float64 [N, T]: how likely what was logged at each step is; NaN where nothing counts."""
 
 
-class Blame(NamedTuple):
+class Attribution(NamedTuple):
     """What one agent costs in one component."""
 
     component: str
@@ -56,6 +56,10 @@ class Blame(NamedTuple):
     """The logged value at that step, in the unit of the component."""
     imagined: float
     """The mean of the rollouts at that step; of an indication the share in which it ever holds."""
+
+
+Blame = Attribution
+"""Former name of `Attribution`, until 0.3."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,7 +112,7 @@ class Scores:
     """float64 [R]: the meta metric without rollout r; on request."""
     per_agent: Optional[AgentRealism] = None
     """On request."""
-    explanation: Optional[List[Blame]] = None
+    explanation: Optional[List[Attribution]] = None
     """Largest first; on request."""
 
     @property
@@ -137,12 +141,12 @@ class Scores:
 _NUMBERS = [field.name for field in dataclasses.fields(Scores)][1:-3]
 
 
-def _scores(told: Dict[str, Any]) -> Scores:
-    if "per_agent" in told:
-        told["per_agent"] = AgentRealism(**told["per_agent"])
-    if "explanation" in told:
-        told["explanation"] = [Blame(**blame) for blame in told["explanation"]]
-    return Scores(**told)
+def _scores(numbers: Dict[str, Any]) -> Scores:
+    if "per_agent" in numbers:
+        numbers["per_agent"] = AgentRealism(**numbers["per_agent"])
+    if "explanation" in numbers:
+        numbers["explanation"] = [Attribution(**one) for one in numbers["explanation"]]
+    return Scores(**numbers)
 
 
 def score(
@@ -162,14 +166,14 @@ def score(
     `scenario.simulated`, in any order. For "2025-generation" T is 91, and `sizes` [R, A, T, 3]
     (length, width, height) and `kinds` [A] are wanted, too.
 
-    `leave_one_out` also scores the others without each rollout, `per_agent` tells whose futures are
-    like the log, `explain` what lowered the score and when.
+    `leave_one_out` also scores the others without each rollout, `per_agent` adds how well each
+    agent fits the log, `explain` what lowered the score and when.
 
     Raises `ValueError` for another shape, an agent that is missing, unknown or doubled, a number that
     is none, no rollouts, or a scenario that the metric is not defined on; `TypeError` for arrays of
     no numbers.
     """
-    told = _native.wosac_score(
+    numbers = _native.wosac_score(
         _scenario(scenario),
         _arrays.ids(agent_id),
         _arrays.numbers(states, "states"),
@@ -180,7 +184,7 @@ def score(
         _arrays.optional(sizes, "sizes"),
         None if kinds is None else list(kinds),
     )
-    return _scores(told)
+    return _scores(numbers)
 
 
 def score_many(
@@ -191,13 +195,13 @@ def score_many(
 ) -> List[Scores]:
     """Scores rollouts of many scenarios over all threads: a list of `agent_id` [A] and of `states`
     [R, A, T, 4], one each per scenario. Raises as `score`."""
-    told = _native.wosac_score_many(
+    numbers = _native.wosac_score_many(
         [_scenario(scenario) for scenario in scenarios],
         [_arrays.ids(one) for one in agent_id],
         [_arrays.numbers(one, "states") for one in states],
         _year(year),
     )
-    return [_scores(one) for one in told]
+    return [_scores(one) for one in numbers]
 
 
 def score_batch(
@@ -215,7 +219,7 @@ def score_batch(
     each agent's scenario, `position` [A, R, T, 2] (x, y), `z` [A, R, T], `heading` [A, R, T].
     Raises as `score`.
     """
-    told = _native.wosac_score_catk(
+    numbers = _native.wosac_score_catk(
         [_scenario(scenario) for scenario in scenarios],
         _arrays.ids(agent_id),
         _arrays.ids(agent_batch, "agent_batch"),
@@ -224,7 +228,7 @@ def score_batch(
         _arrays.numbers(heading, "heading"),
         _year(year),
     )
-    return [_scores(one) for one in told]
+    return [_scores(one) for one in numbers]
 
 
 def score_message(
@@ -237,10 +241,10 @@ def score_message(
 ) -> Scores:
     """Scores a serialized `waymo.open_dataset.ScenarioRollouts` message. Raises as `score`, and
     `DataError` for bytes that are no such message."""
-    told = _native.wosac_score_message(
+    numbers = _native.wosac_score_message(
         _scenario(scenario), bytes(message), _year(year), leave_one_out, per_agent, explain
     )
-    return _scores(told)
+    return _scores(numbers)
 
 
 class RolloutArrays(NamedTuple):

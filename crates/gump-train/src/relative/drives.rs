@@ -10,9 +10,9 @@
 //! `gump_engine::relative::rules`: draws that would overlap an agent or leave the road are redrawn.
 //! The resulting motion is the target, so that the network learns to follow the rules itself.
 
-use gump_engine::relative::engine::{Draw, Engine, Workspace};
+use gump_engine::relative::engine::{Draw, RelativeEngine, Workspace};
 use gump_engine::relative::rules::resolve;
-use gump_engine::relative::seen::{Seen, add_presents};
+use gump_engine::relative::seen::{ObservedAgent, add_presents};
 use gump_geometry::{DVec2, Pose, angle_difference};
 use gump_kernels::panels::Precision;
 use gump_model::local_context::LaneMap;
@@ -85,23 +85,34 @@ impl Default for RelativeDrives {
 impl RelativeDrives {
     /// Error: [`TrainError::Config`] naming the first number out of its range.
     pub(super) fn validate(&self) -> Result<(), TrainError> {
-        let fail = |what: &str| Err(TrainError::Config(format!("closed_loop: {what}")));
-        for (name, share) in [("share", self.share), ("ruled", self.ruled)] {
+        let fail = |key: &'static str, what: &str| {
+            let reason = format!("closed_loop: {what}");
+            Err(TrainError::Config { key, reason })
+        };
+        let shares = [
+            ("closed_loop.share", "share", self.share),
+            ("closed_loop.ruled", "ruled", self.ruled),
+        ];
+        for (key, name, share) in shares {
             if !(0.0..=1.0).contains(&share) {
-                return fail(&format!("{name} must be between 0 and 1"));
+                return fail(key, &format!("{name} must be between 0 and 1"));
             }
         }
         if !(self.top_p > 0.0 && self.top_p <= 1.0) {
-            return fail("top_p must be above 0 and at most 1");
+            return fail("closed_loop.top_p", "top_p must be above 0 and at most 1");
         }
         if self.candidates == 0 || self.refresh == 0 {
-            return fail("candidates and refresh must be at least 1");
+            let key = match self.candidates {
+                0 => "closed_loop.candidates",
+                _ => "closed_loop.refresh",
+            };
+            return fail(key, "candidates and refresh must be at least 1");
         }
         if !self.tolerance_m.is_finite() || self.tolerance_m < 0.0 {
-            return fail("tolerance_m must be 0 or more");
+            return fail("closed_loop.tolerance_m", "tolerance_m must be 0 or more");
         }
         if !self.temperature.is_finite() || self.temperature <= 0.0 {
-            return fail("temperature must be above 0");
+            return fail("closed_loop.temperature", "temperature must be above 0");
         }
         Ok(())
     }
@@ -109,7 +120,7 @@ impl RelativeDrives {
 
 /// A snapshot of the network at a step, which drives.
 pub(crate) struct NetworkDriver {
-    engine: Engine,
+    engine: RelativeEngine,
     config: RelativeDrives,
 }
 
@@ -119,7 +130,7 @@ impl NetworkDriver {
         config: &RelativeDrives,
     ) -> Result<Self, TrainError> {
         Ok(Self {
-            engine: Engine::new(&RelativeWeights::of(network)?, Precision::F32)?,
+            engine: RelativeEngine::new(&RelativeWeights::of(network)?, Precision::F32)?,
             config: config.clone(),
         })
     }
@@ -143,7 +154,7 @@ impl TrackDriver for NetworkDriver {
         let ruled = seed.fork(RULED).rng().random_bool(self.config.ruled);
         let lane_map = ruled.then(|| LaneMap::of_curbs(streets, centre, EDGES_M));
         let memory = self.engine.remember(map);
-        let mut members: Vec<Option<Seen>> = tracks.iter().map(|_| None).collect();
+        let mut members: Vec<Option<ObservedAgent>> = tracks.iter().map(|_| None).collect();
         let (mut room, mut hidden) = (Workspace::default(), Vec::new());
         for (t, lights) in lights.iter().enumerate().take(lights.len().max(1) - 1) {
             for (track, member) in tracks.iter().zip(&mut members) {
@@ -152,11 +163,16 @@ impl TrackDriver for NetworkDriver {
                     (Some(state), Some(seen)) => seen.push(state.shown),
                     (Some(state), None) => {
                         let (pose, velocity) = (state.shown, state.velocity);
-                        *member = Some(Seen::first(&self.engine, track.body, pose, velocity));
+                        *member = Some(ObservedAgent::first(
+                            &self.engine,
+                            track.body,
+                            pose,
+                            velocity,
+                        ));
                     }
                 }
             }
-            let agents: Vec<Shown> = members.iter().flatten().map(Seen::now).collect();
+            let agents: Vec<Shown> = members.iter().flatten().map(ObservedAgent::now).collect();
             let mut read = Vec::new();
             let seen = members.iter_mut().flatten();
             add_presents((map, &memory), lights, seen, t, &mut read);

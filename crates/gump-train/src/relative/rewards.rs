@@ -57,15 +57,25 @@ impl Default for RelativeRewards {
 impl RelativeRewards {
     /// Error: [`TrainError::Config`] naming the first number out of its range.
     pub(super) fn validate(&self) -> Result<(), TrainError> {
-        let fail = |what: &str| Err(TrainError::Config(format!("realism: {what}")));
+        let fail = |key: &'static str, what: &str| {
+            let reason = format!("realism: {what}");
+            Err(TrainError::Config { key, reason })
+        };
         if self.rollouts < 2 {
-            return fail("rollouts must be at least 2, as each is compared with the others");
+            return fail(
+                "realism.rollouts",
+                "rollouts must be at least 2, as each is compared with the others",
+            );
         }
         if self.agents == 0 || self.refresh == 0 {
-            return fail("agents and refresh must be at least 1");
+            let key = match self.agents {
+                0 => "realism.agents",
+                _ => "realism.refresh",
+            };
+            return fail(key, "agents and refresh must be at least 1");
         }
         if !self.weight.is_finite() || self.weight <= 0.0 {
-            return fail("weight must be above 0");
+            return fail("realism.weight", "weight must be above 0");
         }
         Ok(())
     }

@@ -95,8 +95,10 @@ impl RelativeTrainConfig {
     /// [`TrainError::Config`] naming the first that is not.
     pub fn validate(&self) -> Result<(), TrainError> {
         if self.batch == 0 || self.steps == 0 {
-            let what = "batch and steps must be at least 1".to_owned();
-            return Err(TrainError::Config(what));
+            return Err(TrainError::Config {
+                key: if self.batch == 0 { "batch" } else { "steps" },
+                reason: "batch and steps must be at least 1".into(),
+            });
         }
         self.closed_loop
             .as_ref()
@@ -181,11 +183,7 @@ impl BatchSource {
                 return Ok(group);
             }
         }
-        Err(TrainError::Config(
-            "realism: no scene has the second of past and the eight seconds of future at 10 Hz, \
-             the road edges and the agents that its rollouts are compared with"
-                .to_owned(),
-        ))
+        Err(TrainError::NoComparableScene)
     }
 
     fn samples(
@@ -457,8 +455,7 @@ impl RelativeTrainer {
         let state = self.optimizer.state();
         tensors.extend(state.map(|(name, tensor)| (name, tensor.clone())));
         let mut header = gump_model::relative::header(self.trained.config())?;
-        let config =
-            serde_json::to_string(&self.config).map_err(|e| TrainError::Config(e.to_string()))?;
+        let config = serde_json::to_string(&self.config).map_err(TrainError::Json)?;
         header.insert("train".to_owned(), config);
         header.insert("step".to_owned(), self.step.to_string());
         Ok(checkpoint::write(path, tensors, header, StorageType::Full)?)

@@ -7,7 +7,7 @@ use gump_scene::fixture;
 
 use super::targets::{CONTROL_BEGIN, CONTROL_LIGHTS_END, CONTROL_NEWBORN};
 use super::*;
-use crate::closed_loop::DrivenScenario;
+use crate::closed_loop_samples::DrivenScenario;
 
 fn reader() -> Reader {
     Reader {

@@ -6,7 +6,7 @@ use gump_scene::{Agent, AgentId, AgentKind, AgentState, Frame, Rng, Scenario};
 use rand::Rng as _;
 
 use super::SampleConfig;
-use crate::closed_loop::DrivenScenario;
+use crate::closed_loop_samples::DrivenScenario;
 
 /// Maximum distance of the centre from its reference pose, metres: with the 5 m of augmentation it
 /// stays within the grid of 100 m. A rollout re-centres before.

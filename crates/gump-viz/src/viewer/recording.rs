@@ -23,7 +23,7 @@ use re_sdk_types::archetypes::{
 use re_sdk_types::components::{Color, LineStrip3D};
 use re_sdk_types::datatypes::{Quaternion, Rgba32};
 
-use super::{Take, Viewer, class_of, meets, style, window};
+use super::{ShownRollout, Viewer, class_of, meets, style, window};
 use crate::files::write_whole;
 use crate::theme::Rgb;
 use crate::{Theme, VizError};
@@ -92,7 +92,7 @@ impl Viewer<'_> {
     fn log_map(
         &self,
         stream: &RecordingStream,
-        takes: &[Take<'_>],
+        takes: &[ShownRollout<'_>],
     ) -> re_sdk::RecordingStreamResult<()> {
         let (map, colours) = (&self.scenario.map, Theme::Dark.colours());
         let window = window(takes);
@@ -130,7 +130,7 @@ impl Viewer<'_> {
         &self,
         stream: &RecordingStream,
         root: &str,
-        take: &Take<'_>,
+        take: &ShownRollout<'_>,
     ) -> re_sdk::RecordingStreamResult<()> {
         let (agents, lights) = (format!("{root}/agents"), format!("{root}/lights"));
         let hidden = Boxes3D::update_fields().with_show_labels(false);

@@ -4,14 +4,14 @@ use super::config::{Estimator, FeatureConfig};
 
 /// Extent of feature arrays, agent-major; indicators have one step.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Shape {
+pub struct FeatureShape {
     /// Agents.
     pub agents: usize,
     /// Steps.
     pub steps: usize,
 }
 
-impl Shape {
+impl FeatureShape {
     /// The distribution that each value belongs to, in order, and the number of distributions.
     fn groups(self, config: &FeatureConfig) -> (Vec<usize>, usize) {
         let n_steps = if config.independent_timesteps {
@@ -45,7 +45,7 @@ pub fn log_likelihoods(
     log: &[f32],
     simulated: &[&[f32]],
     copies: usize,
-    shape: Shape,
+    shape: FeatureShape,
 ) -> Vec<f32> {
     let (groups, n_groups) = shape.groups(config);
     assert_eq!(
@@ -75,7 +75,7 @@ pub(crate) fn leave_one_out(
     log: &[f32],
     simulated: &[&[f32]],
     copies: usize,
-    shape: Shape,
+    shape: FeatureShape,
 ) -> Vec<Vec<f32>> {
     let histogram = match config.estimator {
         Estimator::Histogram {

@@ -52,7 +52,7 @@ impl Evaluation<'_> {
             let (steps, values) = self.values(component);
             let (own, imagined) = values.split_first().expect("the log comes first");
             let imagined: Vec<&[f32]> = imagined.iter().map(AsRef::as_ref).collect();
-            let shape = super::Shape {
+            let shape = super::FeatureShape {
                 agents: n_agents,
                 steps,
             };

@@ -45,7 +45,7 @@ pub use config::{
     Algorithm, Component, Config, ConfigError, Estimator, FeatureConfig, Group, Mode, Year,
 };
 pub use error::WosacError;
-pub use estimate::{Shape, log_likelihoods};
+pub use estimate::{FeatureShape, log_likelihoods};
 pub use explain::{AgentRealism, Attribution};
 pub use features::Features;
 pub use input::{

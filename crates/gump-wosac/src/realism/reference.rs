@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use super::WosacError;
 use super::assemble::{self, SimulatedAgents};
 use super::config::{Algorithm, Component, Config, Mode};
-use super::estimate::{Shape, log_likelihoods};
+use super::estimate::{FeatureShape, log_likelihoods};
 use super::features::{Features, Surroundings, measure};
 use super::input::{Log, N_HISTORY, Rollouts, Track};
 use super::kinematics::{Differences, validity};
@@ -247,7 +247,7 @@ impl<'a> Evaluation<'a> {
             let (steps, values) = reference.values(component, &imagined);
             let (own, imagined) = values.split_first().expect("the log comes first");
             let imagined: Vec<&[f32]> = imagined.iter().map(AsRef::as_ref).collect();
-            let shape = Shape {
+            let shape = FeatureShape {
                 agents: log.agents.len(),
                 steps,
             };

@@ -297,7 +297,7 @@ fn likelihoods_of(case: &Value) {
     let (log, simulated, shape): (Vec<f32>, Vec<Vec<f32>>, _) = if case["log"].is_string() {
         let log: Vec<f32> = bools(&case["log"]);
         let simulated = case["sim"].as_array().unwrap().iter().map(bools).collect();
-        let shape = Shape {
+        let shape = FeatureShape {
             agents: log.len(),
             steps: 1,
         };
@@ -305,7 +305,7 @@ fn likelihoods_of(case: &Value) {
     } else {
         let log = rows(&case["log"]);
         let simulated = case["sim"].as_array().unwrap().iter();
-        let shape = Shape {
+        let shape = FeatureShape {
             agents: log.len(),
             steps: log[0].len(),
         };

@@ -76,7 +76,7 @@ fn known() -> impl TypedValueParser<Value = String> {
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
-        let class = self.train_variant.begin(run)?;
+        let held_out = self.train_variant.begin(run)?;
         let is_requested = |name: &str| {
             name == FEATURES[0].0 || self.only.is_empty() || self.only.iter().any(|o| o == name)
         };
@@ -84,7 +84,8 @@ impl Args {
         for (name, turn) in FEATURES.into_iter().filter(|(name, _)| is_requested(name)) {
             let (mut model, mut train) = of_width(self.width)?;
             turn(&mut model, &mut train);
-            let learned = class.teach(run, name, (model, train), &[self.train_variant.steps()])?;
+            let learned =
+                held_out.teach(run, name, (model, train), &[self.train_variant.steps()])?;
             let mut row = learned.row()?;
             row["switch"] = json!(name);
             rows.push(row);

@@ -33,12 +33,12 @@ pub(crate) struct Args {
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
-        let class = self.train_variant.begin(run)?;
+        let held_out = self.train_variant.begin(run)?;
         let (mut rows, mut sizes) = (Vec::new(), Vec::new());
         for width in WIDTHS {
             let name = format!("width-{width}");
             let measured = measured(self.train_variant.steps());
-            let learned = class.teach(run, &name, of_width(width)?, &measured)?;
+            let learned = held_out.teach(run, &name, of_width(width)?, &measured)?;
             let mut row = learned.row()?;
             row["width"] = json!(width);
             let slope = slope(&logarithms(&learned.losses));

@@ -1,5 +1,4 @@
-//! Networks that learn the same lesson: trained on the same samples, judged by the same held-out
-//! scenes.
+//! Variants of a network, trained on the same samples and judged by the same held-out scenes.
 
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
@@ -61,8 +60,8 @@ pub(super) struct Learned {
     seconds: f64,
 }
 
-/// A lesson whose held-out scenes are read.
-pub(super) struct Class<'a> {
+/// A training variant with its held-out scenes.
+pub(super) struct HeldOut<'a> {
     train_variant: &'a TrainVariant,
     held_out: PathBuf,
     scenes: Vec<Scenario>,
@@ -76,14 +75,14 @@ impl TrainVariant {
     }
 
     /// Reads the held-out scenes.
-    pub(super) fn begin(&self, run: &mut Run) -> anyhow::Result<Class<'_>> {
+    pub(super) fn begin(&self, run: &mut Run) -> anyhow::Result<HeldOut<'_>> {
         let held_out = match &self.scenarios {
             Some(path) => path.clone(),
             None => shipped::data().join("procedural.tfrecord.gz"),
         };
         run.setting("scenarios", held_out.display().to_string())?;
         let progress = run.progress("reading", 0, "scenarios");
-        Ok(Class {
+        Ok(HeldOut {
             train_variant: self,
             scenes: datasets::read(&[Part::whole(&held_out)], &progress)?,
             decodings: self.draw.decodings(Mode::PartialAr)?,
@@ -102,7 +101,7 @@ pub(super) fn of_width(width: usize) -> anyhow::Result<(ModelConfig, TrainConfig
     Ok((model, RunConfig::from_toml(CONFIG)?.train))
 }
 
-impl Class<'_> {
+impl HeldOut<'_> {
     /// Trains a network, writes its weights as `name`, measures the loss after the steps in
     /// `measured`, and judges its traffic.
     pub(super) fn teach(

@@ -131,6 +131,7 @@ struct Cost {
     cpu: f64,
     passes: u64,
     operations: u64,
+    cache_bytes: usize,
 }
 
 impl Args {
@@ -204,7 +205,7 @@ impl Args {
                     "gflop_per_frame": way.engine.then(|| cost.operations as f64 / cost.frames as f64 / 1e9),
                     "fraction_of_gemm": way.engine.then_some(rate / gemm),
                     "weights_mb": world.weight_bytes() as f64 / 1e6,
-                    "kept_mb": world.context_bytes() as f64 / 1e6,
+                    "kept_mb": cost.cache_bytes as f64 / 1e6,
                 });
                 run.print(&format!(
                     "{size} x {n_futures}, {} {}: {:.1} ms of processor time a frame",
@@ -375,7 +376,7 @@ fn measure(
         let mut warm = world.open(&[start]).map_err(failed)?;
         warm.step(None).map_err(failed)?;
     }
-    let (passes, operations) = (world.passes(), world.operations());
+    let before = session.stats();
     let (cpu, began) = (cpu_seconds(), Instant::now());
     for _ in 0..steps {
         stop_if_interrupted()?;
@@ -385,13 +386,15 @@ fn measure(
     let cpu = cpu_seconds()
         .zip(cpu)
         .map_or(wall, |(after, before)| after - before);
+    let after = session.stats();
     Ok(Cost {
         frames: steps * n_futures,
         steps,
         wall,
         cpu,
-        passes: world.passes() - passes,
-        operations: world.operations() - operations,
+        passes: after.passes - before.passes,
+        operations: after.operations - before.operations,
+        cache_bytes: after.cache_bytes,
     })
 }
 

@@ -15,6 +15,7 @@ pub(crate) mod motion;
 mod open_loop;
 mod ranking;
 pub(crate) mod reactions;
+mod warnings;
 pub(crate) mod wosac;
 
 pub(crate) use closed_loop::Driving;

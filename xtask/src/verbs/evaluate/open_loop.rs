@@ -12,6 +12,7 @@ use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::closed_loop::mean;
+use super::warnings::{self, failed_drives, missing_intervals};
 use crate::cli::WrongArguments;
 use crate::planners::{ImaginationArgs, planner};
 use crate::run::{Common, Run};
@@ -83,7 +84,10 @@ impl Args {
         let names = names.map(String::from).collect();
         let chart = charts::bars(label, names, vec!["score".into()], scores);
         charts::save(run, "scores", &chart)?;
+        let mut sentences = Vec::from_iter(failed_drives(&rows));
+        sentences.extend(missing_intervals(&rows));
         run.result("rows", rows)?;
+        warnings::report(run, &sentences)?;
         run.result("scenarios", &scenarios)?;
         super::any_succeeded(&scenarios)
     }

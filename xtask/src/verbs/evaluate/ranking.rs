@@ -1,6 +1,8 @@
-//! Pairwise comparisons of planners in every world, their significance, and pairs on which worlds
-//! disagree.
+//! Pairwise comparisons of planners in every world, their significance, the scenes that they come
+//! from, and pairs on which worlds disagree.
 
+use gump_eval::closed_loop::ScenarioDrives;
+use gump_eval::results::Entry;
 use gump_eval::worlds::WorldName;
 use gump_planner::Comparison;
 use gump_scene::Seed;
@@ -9,6 +11,10 @@ use serde_json::{Value, json};
 use super::closed_loop::{COLUMNS, PlannerDrives};
 use crate::run::Run;
 use crate::table;
+
+/// Scenes of a comparison that are named on either side of 0. Chosen by hand: as many films as
+/// somebody looks at.
+const N_SCENES_NAMED: usize = 5;
 
 /// The table of one world as text of so many columns: percent, without what is the same in every row.
 pub(super) fn table_of(world: &WorldName, rows: &[Value], width: usize) -> String {
@@ -26,29 +32,35 @@ pub(super) fn table_of(world: &WorldName, rows: &[Value], width: usize) -> Strin
     table::text(&json!({ format!("among {world}, %"): shown }), width)
 }
 
-/// Compares all pairs of planners in every world and warns where a pair changes places.
+/// Compares all pairs of planners in every world and warns where a pair changes places. Further
+/// warnings are returned.
 pub(super) fn report(
     run: &mut Run,
     worlds: &[(String, Vec<PlannerDrives<'_>>)],
-) -> anyhow::Result<()> {
+) -> anyhow::Result<Option<String>> {
     let Some((_, planners)) = worlds.first().filter(|(_, drives)| drives.len() > 1) else {
-        return Ok(());
+        return Ok(None);
     };
     let (mut comparisons, mut changes) = (Vec::new(), Vec::new());
+    let (mut extremes, mut unsure) = (Vec::new(), Vec::new());
     for a in 0..planners.len() {
         for b in a + 1..planners.len() {
             let mut found = Vec::new();
             for (world, drives) in worlds {
-                let Some(compared) = compare(&drives[a], &drives[b], run.seed()) else {
-                    continue;
-                };
-                comparisons.push(comparison_row(world, &drives[a], &drives[b], &compared));
-                found.push((world, compared.difference, compared.is_sure()));
+                let pair = Pair::of(world, &drives[a], &drives[b]);
+                let compared = pair.compare(run.seed());
+                comparisons.push(pair.row(compared.as_ref()));
+                extremes.extend(pair.extremes());
+                match compared {
+                    Some(compared) => found.push((world, compared.difference, compared.is_sure())),
+                    None => unsure.push(pair.without_interval()),
+                }
             }
             changes.extend(changed(&planners[a].planner, &planners[b].planner, &found));
         }
     }
     run.result("comparisons", comparisons)?;
+    run.result("wins_and_losses", extremes)?;
     let (sure, noise): (Vec<&Change>, Vec<&Change>) = changes.iter().partition(|c| c.is_sure());
     for change in sure {
         run.print(&format!("warning: {}", change.sentence()));
@@ -60,7 +72,14 @@ pub(super) fn report(
         ));
     }
     let rows = changes.iter().map(Change::to_json);
-    run.result("ranking_changes", rows.collect::<Vec<_>>())
+    run.result("ranking_changes", rows.collect::<Vec<_>>())?;
+    Ok((!unsure.is_empty()).then(|| {
+        format!(
+            "differences without an interval, which takes at least 2 scenarios that both drove to \
+             the end: {}",
+            unsure.join(", ")
+        )
+    }))
 }
 
 /// Two planners whose order differs between two worlds.
@@ -99,28 +118,82 @@ impl Change {
     }
 }
 
-/// Of the scenarios that both drove to the end.
-fn compare(a: &PlannerDrives<'_>, b: &PlannerDrives<'_>, seed: Seed) -> Option<Comparison> {
-    let pairs = a.scores().zip(b.scores());
-    let (a, b): (Vec<f64>, Vec<f64>) = pairs.filter_map(|(a, b)| a.zip(b)).unzip();
-    Comparison::of_scenes(&a, &b, seed)
+/// Two planners in one world, in the scenarios that both drove to the end.
+struct Pair<'a> {
+    world: &'a str,
+    planners: [&'a str; 2],
+    /// With the scores of both.
+    scenes: Vec<(&'a Entry<ScenarioDrives>, f64, f64)>,
 }
 
-fn comparison_row(
-    world: &str,
-    a: &PlannerDrives<'_>,
-    b: &PlannerDrives<'_>,
-    compared: &Comparison,
-) -> Value {
-    json!({
-        "world": world,
-        "planner": a.planner,
-        "less": b.planner,
-        "difference": compared.difference,
-        "low": compared.interval.low,
-        "high": compared.interval.high,
-        "scenarios_needed": compared.scenes_needed(1),
-    })
+impl<'a> Pair<'a> {
+    fn of(world: &'a str, a: &'a PlannerDrives<'_>, b: &'a PlannerDrives<'_>) -> Self {
+        let both = a.scenes().zip(b.scores());
+        let scenes = both.filter_map(|((entry, a), b)| Some((entry, a?, b?)));
+        Self {
+            world,
+            planners: [&a.planner, &b.planner],
+            scenes: scenes.collect(),
+        }
+    }
+
+    /// `None` for fewer than two scenarios.
+    fn compare(&self, seed: Seed) -> Option<Comparison> {
+        let scores = self.scenes.iter().map(|&(_, a, b)| (a, b));
+        let (a, b): (Vec<f64>, Vec<f64>) = scores.unzip();
+        Comparison::of_scenes(&a, &b, seed)
+    }
+
+    /// The row of a comparison; a single scenario has a difference as well.
+    fn row(&self, compared: Option<&Comparison>) -> Value {
+        let single = || self.scenes.first().map(|(_, a, b)| a - b);
+        json!({
+            "world": self.world,
+            "planner": self.planners[0],
+            "less": self.planners[1],
+            "difference": compared.map(|compared| compared.difference).or_else(single),
+            "low": compared.map(|compared| compared.interval.low),
+            "high": compared.map(|compared| compared.interval.high),
+            "scenarios_needed": compared.and_then(|compared| compared.scenes_needed(1)),
+            "scenarios": self.scenes.len(),
+        })
+    }
+
+    fn without_interval(&self) -> String {
+        let [a, b] = self.planners;
+        format!("{a} less {b} among {} ({})", self.world, self.scenes.len())
+    }
+
+    /// The scenes in which the first planner gains most over the second, from the largest gain, then
+    /// those in which it loses most, from the largest loss.
+    fn extremes(&self) -> Vec<Value> {
+        let difference = |scene: &(&Entry<ScenarioDrives>, f64, f64)| scene.1 - scene.2;
+        let mut wins: Vec<_> = self.scenes.iter().collect();
+        // Equal ones in the order of the scenarios: the sorts are stable.
+        let mut losses = wins.clone();
+        wins.sort_by(|a, b| difference(b).total_cmp(&difference(a)));
+        losses.sort_by(|a, b| difference(a).total_cmp(&difference(b)));
+        wins.retain(|scene| difference(scene) > 0.0);
+        losses.retain(|scene| difference(scene) < 0.0);
+        let named = [wins, losses].into_iter().flat_map(|side| {
+            let rows = side.into_iter().take(N_SCENES_NAMED);
+            rows.map(|scene| {
+                let (entry, a, b) = scene;
+                json!({
+                    "world": self.world,
+                    "planner": self.planners[0],
+                    "less": self.planners[1],
+                    "id": entry.id,
+                    "difference": difference(scene),
+                    "score": a,
+                    "less_score": b,
+                    "index": entry.index,
+                    "log_name": entry.scores.log_name,
+                })
+            })
+        });
+        named.collect()
+    }
 }
 
 /// Every two worlds that disagree about two planners.
@@ -144,6 +217,70 @@ fn changed(a: &str, b: &str, found: &[(&String, f64, bool)]) -> Vec<Change> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn scene(index: usize) -> Entry<ScenarioDrives> {
+        Entry {
+            index,
+            id: format!("s{index}"),
+            scores: ScenarioDrives {
+                log_name: "log".into(),
+                scenario_type: "unknown".into(),
+                outcomes: Vec::new(),
+            },
+        }
+    }
+
+    fn pair(scenes: &[(Entry<ScenarioDrives>, f64, f64)]) -> Pair<'_> {
+        Pair {
+            world: "idm",
+            planners: ["a", "b"],
+            scenes: scenes.iter().map(|(entry, a, b)| (entry, *a, *b)).collect(),
+        }
+    }
+
+    #[test]
+    fn scenes_that_are_won_and_lost_are_named_from_the_largest() {
+        // Differences of -0.7, -0.6 ... 0.7; one scene is equal.
+        let scenes: Vec<_> = (0..15).map(|i| (scene(i), 0.1 * i as f64, 0.7)).collect();
+        let rows = pair(&scenes).extremes();
+        let ids: Vec<&str> = rows.iter().filter_map(|row| row["id"].as_str()).collect();
+        let expected = [
+            "s14", "s13", "s12", "s11", "s10", "s0", "s1", "s2", "s3", "s4",
+        ];
+        assert_eq!(ids, expected);
+        for row in rows {
+            let number = |key: &str| row[key].as_f64().unwrap();
+            assert_eq!(number("difference"), number("score") - number("less_score"));
+            assert_eq!(row["id"], format!("s{}", row["index"]));
+        }
+        // Sides are no longer than they are, ties in order of the scenes.
+        let equal = [
+            (scene(3), 0.2, 0.1),
+            (scene(1), 0.2, 0.1),
+            (scene(7), 0.5, 0.5),
+        ];
+        let rows = pair(&equal).extremes();
+        let ids: Vec<&str> = rows.iter().filter_map(|row| row["id"].as_str()).collect();
+        assert_eq!(ids, ["s3", "s1"]);
+    }
+
+    #[test]
+    fn a_single_scene_has_a_difference_without_an_interval() {
+        let check = |n: usize, difference: Value, has_interval: bool| {
+            let scenes: Vec<_> = (0..n).map(|i| (scene(i), 0.75, 0.25)).collect();
+            let pair = pair(&scenes);
+            let compared = pair.compare(Seed(0));
+            assert_eq!(compared.is_some(), has_interval);
+            let row = pair.row(compared.as_ref());
+            assert_eq!(row["difference"], difference);
+            assert_eq!(row["scenarios"], n);
+            assert_eq!(row["low"].is_number(), has_interval, "{row}");
+            assert_eq!(pair.without_interval(), format!("a less b among idm ({n})"));
+        };
+        check(0, Value::Null, false);
+        check(1, 0.5.into(), false);
+        check(2, 0.5.into(), true);
+    }
 
     #[test]
     fn only_worlds_that_disagree_are_named() {

@@ -309,7 +309,7 @@ impl Args {
                     (source, datasets::read_first(most, &held_out, &progress)?)
                 }
             };
-            warn_of_frozen(run, &source)?;
+            benchmark::warn_of_frozen(run, source.ids(), "what these weights score")?;
             validation.extend(held_out);
             training.push((share, source));
         }
@@ -370,23 +370,6 @@ impl Learns for Trainer {
             StorageType::Half,
         )?)
     }
-}
-
-/// Warns if the training data contain scenes of a frozen set.
-///
-/// Error: a list of this repository that cannot be read.
-fn warn_of_frozen(run: &Run, training: &TrainingSet) -> anyhow::Result<()> {
-    let frozen = benchmark::frozen_ids()?;
-    let sets = training.ids().filter_map(|id| Some((id, frozen.get(id)?)));
-    let found: Vec<_> = sets.collect();
-    if let Some((id, set)) = found.first() {
-        run.print(&format!(
-            "warning: {} training scenes are of frozen sets, {id} of {set} for one: \
-             what these weights score there says nothing",
-            found.len()
-        ));
-    }
-    Ok(())
 }
 
 /// Warns if matrix products in bfloat16 take longer than in f32 on this processor.

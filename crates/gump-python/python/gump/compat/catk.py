@@ -36,7 +36,7 @@ class WOSACMetrics:
     """Mean realism over scenarios, with CAT-K's keys.
 
     `ego_only` scores the ego alone, as if nobody else had been recorded. CAT-K measures by the challenge of
-    2024, so that is what `year` is; with 2025 two more likelihoods are told.
+    2024, so that is what `year` is; with 2025 two more likelihoods are given.
     """
 
     def __init__(self, prefix: str, ego_only: bool = False, year: wosac.Year = 2024) -> None:
@@ -44,8 +44,8 @@ class WOSACMetrics:
         self.ego_only = ego_only
         self.year = year
         has_lights = "traffic_light_violation_likelihood" in wosac.weights(year)
-        self._told = _FIELDS + (_LIGHTS if has_lights else [])
-        self._running = Running(self._told + _GROUPS)
+        self._names = _FIELDS + (_LIGHTS if has_lights else [])
+        self._running = Running(self._names + _GROUPS)
 
     def update(
         self, scenario_files: Sequence[Union[str, "os.PathLike[str]", _native.Scenario]], scenario_rollouts: Sequence[Any]
@@ -86,9 +86,9 @@ class WOSACMetrics:
             "min_ade": means["min_average_displacement_error"],
             "scenario_counter": self._running.total(),
         }
-        told = {f"{self.prefix}/wosac/{name}": tensor(number) for name, number in found.items()}
-        likelihoods = {f"{self.prefix}/wosac_likelihood/{name}": tensor(means[name]) for name in self._told}
-        return {**told, **likelihoods}
+        named = {f"{self.prefix}/wosac/{name}": tensor(number) for name, number in found.items()}
+        likelihoods = {f"{self.prefix}/wosac_likelihood/{name}": tensor(means[name]) for name in self._names}
+        return {**named, **likelihoods}
 
     def reset(self) -> None:
         """Forgets all scenarios."""

@@ -33,7 +33,7 @@ _STATIC = ("traffic_cone", "barrier", "sign", "other")
 class Planner:
     """A planner of nuplan-devkit, to be given to `gump.nuplan.simulate`.
 
-    It is told what the devkit tells: `PlannerInitialization` with `map_api` as given here (most planners want the
+    It is given what the devkit gives: `PlannerInitialization` with `map_api` as given here (most planners want the
     devkit's map of the place), and `PlannerInput` with a history of `EgoState` and `DetectionsTracks`; tokens of
     agents are their ids.
 
@@ -189,7 +189,7 @@ class MetricsEngine:
 
     def compute(self, history: Any, scenario: Any, planner_name: str) -> Dict[str, List[Any]]:
         """The scores by the devkit's name of the simulation: `MetricFile`s with a score each where nuplan-devkit is
-        loaded, else pairs of a metric's name and its score. Statistics and time series are not told."""
+        loaded, else pairs of a metric's name and its score. Statistics and time series are not given."""
         found = self.score(history, scenario)
         name = f"{scenario.scenario_type}_{scenario.scenario_name}_{planner_name}"
         if "nuplan.planning" not in sys.modules:

@@ -58,7 +58,7 @@ class WOSACEvaluator:
 
         Gives a table with one row per scenario (a `pandas.DataFrame` where pandas can be had, else a dictionary of
         dictionaries by scenario), with PufferDrive's names; with `aggregate_results` a dictionary of means. Collisions
-        and drives off the road of the log are not told. Agents that are absent at the present are left out.
+        and drives off the road of the log are not given. Agents that are absent at the present are left out.
 
         Raises `ValueError` for other shapes and ids that differ, `KeyError` for a dictionary without one of these,
         and as `gump.wosac.score`.
@@ -95,10 +95,10 @@ class _Batch:
         self.valid = np.asarray(truth["valid"]).astype(bool).reshape(agents, steps)
         self.ids = _arrays.ids(truth["id"], "id").reshape(agents)
         self.scenario_id = np.asarray(truth["scenario_id"]).reshape(agents)
-        told = _arrays.ids(simulated["id"], "id").reshape(agents, n_rollouts, -1)[:, 0, 0]
-        if (told != self.ids).any():
-            at = int(np.flatnonzero(told != self.ids)[0])
-            raise ValueError(f"id: expected {self.ids[at]} for agent {at} as in the log, found {told[at]}")
+        ids = _arrays.ids(simulated["id"], "id").reshape(agents, n_rollouts, -1)[:, 0, 0]
+        if (ids != self.ids).any():
+            at = int(np.flatnonzero(ids != self.ids)[0])
+            raise ValueError(f"id: expected {self.ids[at]} for agent {at} as in the log, found {ids[at]}")
         self.sizes = [_arrays.numbers(state[name], name, np.float64).reshape(agents) for name in ("length", "width")]
         self.kinds = [_kind(kind) for kind in state.get("kind", ["vehicle"] * agents)]
 
@@ -139,7 +139,7 @@ class _Batch:
             if not self.valid[row, step]:
                 states.append(absent)
                 continue
-            # Velocities are not told; the metric takes its own from positions.
+            # Velocities are not given; the metric takes its own from positions.
             place = _double(2, x[step]) + _double(3, y[step]) + _double(4, 0.0)
             states.append(_field(3, place + size + _float(8, heading[step]) + _varint_field(11, 1)))
         return _varint_field(1, number) + _varint_field(2, self.kinds[row]) + b"".join(states)
@@ -148,13 +148,13 @@ class _Batch:
 class _Edges:
     """Road edges of all scenarios."""
 
-    def __init__(self, told: Dict[str, Any]) -> None:
-        lengths = _arrays.ids(told["lengths"], "lengths").ravel()
-        points = [_arrays.numbers(told[name], name, np.float64).ravel() for name in ("x", "y")]
+    def __init__(self, values: Dict[str, Any]) -> None:
+        lengths = _arrays.ids(values["lengths"], "lengths").ravel()
+        points = [_arrays.numbers(values[name], name, np.float64).ravel() for name in ("x", "y")]
         if len(points[0]) != lengths.sum() or len(points[1]) != lengths.sum():
             found = f"{len(points[0])} and {len(points[1])}"
             raise ValueError(f"road_edge_polylines: expected {lengths.sum()} x and y as lengths say, found {found}")
-        self._scenario_id = np.asarray(told["scenario_id"]).ravel()
+        self._scenario_id = np.asarray(values["scenario_id"]).ravel()
         if len(self._scenario_id) != len(lengths):
             found = len(self._scenario_id)
             raise ValueError(f"road_edge_polylines: expected {len(lengths)} scenario_id, one per polyline, found {found}")

@@ -36,10 +36,10 @@ class WOSACMetric:
 
     def __init__(self, version: str = "2025") -> None:
         self.version = version
-        told = [name for name in waymo._METRIC_FIELDS if name != "scenario_id"]
+        names = [name for name in waymo._METRIC_FIELDS if name != "scenario_id"]
         if "traffic_light_violation_likelihood" not in wosac.weights(version):
-            told = [name for name in told if "traffic_light" not in name]
-        self._running = Running(told)
+            names = [name for name in names if "traffic_light" not in name]
+        self._running = Running(names)
 
     def update(
         self, scenario_id: Sequence[Any], gt_scenarios: Sequence[Any], agent_id: Any, agent_batch: Any, simulated_states: Any

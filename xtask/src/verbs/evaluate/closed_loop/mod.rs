@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use gump_eval::benchmarks::{ScenarioSet, ScenarioSetName};
 use gump_eval::closed_loop::{
-    BENCHMARK, ClosedLoopEvaluation, ClosedLoopSettings, ScenarioDrives, VisitedDrive,
+    BENCHMARK, ClosedLoopEvaluation, ClosedLoopSettings, ScenarioDrives, VisitedDrive, checksums,
 };
 use gump_eval::planners::PlanningWorld;
 use gump_eval::recordings;
@@ -127,12 +127,6 @@ impl Args {
         let thinking = self.thinking.config()?;
         let sampling = self.sampling.resolve()?;
         let found = benchmark::find(run, &self.scenarios)?;
-        let settings = self.settings(run, &found)?;
-        let header = Header {
-            benchmark: BENCHMARK.into(),
-            shard: self.shard,
-            settings: toml::Table::try_from(&settings)?,
-        };
         let imagined = run.phase("load", |run| {
             let name = self.imagination();
             Ok(PlanningWorld::load_imagination(
@@ -149,6 +143,12 @@ impl Args {
             let worlds = self.world.iter().map(load);
             worlds.collect::<anyhow::Result<Vec<_>>>()
         })?;
+        let settings = run.phase("find", |run| self.settings(run, &found))?;
+        let header = Header {
+            benchmark: BENCHMARK.into(),
+            shard: self.shard,
+            settings: toml::Table::try_from(&settings)?,
+        };
         let remotes = Remote::of(&self.planner, self.driving.budget());
         let evaluation = ClosedLoopEvaluation {
             planners: &evaluated(&self.planner, &remotes),
@@ -161,8 +161,7 @@ impl Args {
         };
         let store: ResultStore<ScenarioDrives> = ResultStore::open(run.out(), &header)?;
         let entries = run.phase("drive", |run| {
-            let limit = self.limit.map_or(usize::MAX, NonZeroUsize::get);
-            let cases = recordings::open_all(&found.paths)?.take(limit);
+            let cases = recordings::open_all(&found.paths)?.take(self.limit());
             let progress = run.progress("driving", 0, "scenarios");
             let visit = |drive: VisitedDrive<'_>| match drive.index < self.films {
                 true => film(run, &drive),
@@ -187,7 +186,13 @@ impl Args {
         named.unwrap_or(&WorldName::Idm)
     }
 
+    fn limit(&self) -> usize {
+        self.limit.map_or(usize::MAX, NonZeroUsize::get)
+    }
+
     fn settings(&self, run: &Run, found: &ScenarioSet) -> anyhow::Result<ClosedLoopSettings> {
+        let ids = recordings::ids(&found.paths, self.limit())?;
+        let worlds = self.world.iter().chain([self.imagination()]);
         Ok(ClosedLoopSettings {
             scenarios: found.name.clone(),
             limit: self.limit.map(NonZeroUsize::get),
@@ -198,6 +203,7 @@ impl Args {
             imagining: serde_json::to_string(&self.thinking)?,
             sampling: serde_json::to_string(&self.sampling)?,
             seed: run.seed().0.to_string(),
+            checksums: checksums(&ids, worlds)?,
         })
     }
 }

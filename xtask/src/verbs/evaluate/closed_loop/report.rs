@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use anyhow::Context as _;
 use gump_eval::closed_loop::{ClosedLoopSettings, DriveOutcome, ScenarioDrives};
 use gump_eval::results::{self, Entry, MissingShards};
 use gump_eval::worlds::WorldName;
@@ -12,6 +13,7 @@ use gump_viz::Bars;
 use serde_json::{Value, json};
 
 use crate::run::Run;
+use crate::verbs::evaluate::warnings::{self, failed_drives, missing_intervals};
 use crate::verbs::evaluate::{any_succeeded, ranking};
 use crate::{charts, tables};
 
@@ -36,6 +38,16 @@ pub(in crate::verbs::evaluate) struct PlannerDrives<'a> {
 }
 
 impl PlannerDrives<'_> {
+    /// The scenarios, in their order, with their scores; `None` where one failed.
+    pub(in crate::verbs::evaluate) fn scenes(
+        &self,
+    ) -> impl Iterator<Item = (&Entry<ScenarioDrives>, Option<f64>)> {
+        self.drives
+            .iter()
+            .map(|(entry, _)| *entry)
+            .zip(self.scores())
+    }
+
     /// The scores of the scenarios, in their order; `None` where one failed.
     pub(in crate::verbs::evaluate) fn scores(&self) -> impl Iterator<Item = Option<f64>> + '_ {
         let outcomes = self.drives.iter().map(|(_, outcome)| outcome);
@@ -50,7 +62,10 @@ pub(crate) fn report_merged(
     missing: MissingShards,
 ) -> anyhow::Result<()> {
     let (header, entries) = results::merge::<ScenarioDrives>(folders, missing)?;
-    report(run, &header.settings.try_into()?, &entries)
+    let settings: ClosedLoopSettings = header.settings.try_into()?;
+    // Intervals of the same draws as those of the evaluation on one machine.
+    run.reseed(settings.seed.parse().context("the seed in the ledger")?);
+    report(run, &settings, &entries)
 }
 
 /// Fills the report of a run.
@@ -84,8 +99,11 @@ pub(super) fn report(
     })?;
     run.result("imagination", &settings.imagination)?;
     charts::save(run, "scores", &chart(&rows, &settings.worlds))?;
+    let mut sentences = Vec::from_iter(failed_drives(&rows));
+    sentences.extend(missing_intervals(&rows));
     run.result("rows", rows)?;
-    ranking::report(run, &worlds)?;
+    sentences.extend(ranking::report(run, &worlds)?);
+    warnings::report(run, &sentences)?;
     run.result("scenarios", &scenarios)?;
     any_succeeded(&scenarios)
 }

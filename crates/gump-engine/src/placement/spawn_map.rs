@@ -32,7 +32,7 @@ const SECTORS: usize = 64;
 
 /// The open cells of one scene for one class.
 #[derive(Clone, Debug)]
-pub struct Ground {
+pub struct SpawnMap {
     cells: Vec<Cell>,
     /// By bin of the velocity along x, then along y: whether traffic moves in that direction
     /// anywhere. Empty where any direction is allowed.
@@ -63,7 +63,7 @@ pub(crate) enum Entry {
     Gate,
 }
 
-impl Ground {
+impl SpawnMap {
     /// The open cells of a class.
     pub fn of_class(map: &MapGraph, world_from_scene: Pose, kind: AgentKind) -> Self {
         let mut ground = Self::closed();
@@ -288,7 +288,7 @@ mod tests {
             "lane 1: -50,0 50,0\nlane 2: 50,4 -50,4\nedge: -50,-2 50,-2\nego vehicle 0: 0,0",
         )
         .unwrap();
-        let ground = |kind| Ground::of_class(&scenario.map, Pose::IDENTITY, kind);
+        let ground = |kind| SpawnMap::of_class(&scenario.map, Pose::IDENTITY, kind);
         let road = ground(AgentKind::Vehicle);
         let there = road.cell(dvec2(10.2, 0.3)).unwrap();
         assert!(there.is_open && goes(&there.ways, 0.0, 0.1) && !goes(&there.ways, 3.1, 0.1));
@@ -308,7 +308,7 @@ mod tests {
         let scenario =
             fixture::scenario("lane 1: -150,0 150,0\nlane 2: -40,30 40,30\nego vehicle 0: 0,0")
                 .unwrap();
-        let ground = Ground::of_class(&scenario.map, Pose::IDENTITY, AgentKind::Vehicle);
+        let ground = SpawnMap::of_class(&scenario.map, Pose::IDENTITY, AgentKind::Vehicle);
         let entries = ground.entries();
         let open = |x: f64, y: f64| entries.cell(dvec2(x, y)).unwrap().is_open;
         assert!(open(-90.0, 0.3) && open(90.0, 0.3) && !open(0.0, 0.3));
@@ -320,7 +320,7 @@ mod tests {
     #[test]
     fn a_lane_that_is_not_there_has_no_ground() {
         let scenario = fixture::scenario("lane 1: 500,0 600,0\nego vehicle 0: 0,0").unwrap();
-        let lane = |id| Ground::of_lane(&scenario.map, Pose::IDENTITY, LaneId(id));
+        let lane = |id| SpawnMap::of_lane(&scenario.map, Pose::IDENTITY, LaneId(id));
         assert!(lane(7).is_none());
         assert!(lane(1).unwrap().is_closed());
     }
