@@ -3,6 +3,7 @@
 use gump_geometry::{DVec2, Pose};
 use gump_model::relative::graph::{Body, Lights, PAST, Shown, look, past_edge};
 use gump_model::relative::map::VectorMap;
+use gump_scene::AgentKind;
 
 use crate::relative::engine::{AgentMemory, KEPT, MapMemory, Present, RelativeEngine};
 
@@ -35,6 +36,13 @@ impl ObservedAgent {
         }
     }
 
+    /// Forgets its past: it is shown as seen for the first time, at this speed, metres per second.
+    pub fn restart(&mut self, engine: &RelativeEngine, speed: f64) {
+        let now = self.now();
+        let velocity = now.pose.direction() * speed;
+        *self = Self::first(engine, now.body, now.pose, velocity);
+    }
+
     /// Advances by half a second to this pose.
     pub fn push(&mut self, pose: Pose) {
         self.shown.push(self.now().then(pose));
@@ -43,12 +51,25 @@ impl ObservedAgent {
     }
 }
 
-/// Adds the network's inputs for the agents of a frame, frame `t` of a future.
+/// A frame of a future.
+#[derive(Clone, Copy, Debug)]
+pub struct FrameIndex {
+    /// Its index.
+    pub t: usize,
+    /// Whether the rollout is so long that vehicles without a reason to slow down are shown without
+    /// their past.
+    pub is_late: bool,
+}
+
+/// Adds the network's inputs for the agents of a frame.
+///
+/// An agent's past are its own draws: a vehicle that happened to slow down is expected to go on
+/// slowing down, and stops on a free road. Without the past it returns to its speed (result 23).
 pub fn add_presents<'a>(
     (map, memory): (&VectorMap, &'a MapMemory),
     lights: &Lights,
     seen: impl Iterator<Item = &'a mut ObservedAgent>,
-    t: usize,
+    frame: FrameIndex,
     presents: &mut Vec<Present<'a>>,
 ) {
     let first = presents.len();
@@ -56,8 +77,13 @@ pub fn add_presents<'a>(
     let agents: Vec<Shown> = seen.iter().map(|seen| seen.now()).collect();
     presents.extend(seen.into_iter().enumerate().map(|(i, seen)| {
         let now = &agents[i];
-        let past = seen.shown.iter().rev().take(PAST + 1).enumerate();
         let mut view = look(map, lights, &agents, i);
+        let is_vehicle = now.body.kind == AgentKind::Vehicle;
+        let past = match frame.is_late && is_vehicle && view.is_free(now) {
+            true => 0,
+            false => PAST,
+        };
+        let past = seen.shown.iter().rev().take(past + 1).enumerate();
         view.neighbours.iter_mut().for_each(|(j, _)| *j += first);
         Present {
             numbers: now.numbers(),
@@ -65,7 +91,7 @@ pub fn add_presents<'a>(
             view,
             memory: &mut seen.memory,
             map: memory,
-            t,
+            t: frame.t,
         }
     }));
 }

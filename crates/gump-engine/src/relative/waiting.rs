@@ -4,7 +4,7 @@
 //! in a queue. In a longer rollout agents that have waited for each other, or for one that has
 //! left, look like those and never start. Here it is decided from the map, the lights and the other
 //! agents whether an agent could drive on; the world then shows such agents to the network as
-//! having just stopped. Whether and how they start remains the network's decision.
+//! moving slowly, without their past. Whether and how they start remains the network's decision.
 //!
 //! Two other places ask why a vehicle stands, for other purposes and therefore with other reasons:
 //! `behaviour/free_road.rs` of `gump-metrics`, which counts stops, and `reason.rs` of
@@ -38,12 +38,21 @@ const ASTRAY_M: f64 = 2.5;
 const TURNED: f64 = 0.9;
 /// Distance ahead within which lights and crossing traffic are considered, metres.
 const LOOK_M: f64 = 25.0;
-/// The free path that a start needs beyond the front bumper, metres: a car's length.
-const ROOM_M: f64 = 5.0;
-/// Space beside the path, from the side of the agent, that others are not in, metres; people need
-/// more, unless they have stood there for as long.
-const SIDE_M: f64 = 0.3;
+/// Space beside the path for people, from the side of the agent, metres, unless they have stood
+/// there for as long.
 const SIDE_OF_PEOPLE_M: f64 = 1.0;
+/// The room that a start needs: ahead a car's length.
+const USUAL: Room = Room {
+    ahead_m: 5.0,
+    beside_m: 0.3,
+    returns: true,
+};
+/// The room that suffices for agents that hold each other.
+const TIGHT: Room = Room {
+    ahead_m: 2.0,
+    beside_m: 0.1,
+    returns: false,
+};
 /// Crossing traffic within this time is let pass, seconds, ...
 const GAP_S: f64 = 4.0;
 /// ... if it comes this near to the path, from its own side, metres, ...
@@ -65,11 +74,22 @@ pub(super) struct Standing {
     pub(super) has_driven: bool,
 }
 
+/// The room that others must leave.
+struct Room {
+    /// Beyond the front bumper, metres.
+    ahead_m: f64,
+    /// From the side of the agent, metres.
+    beside_m: f64,
+    /// Whether the path to the lane's centre is included.
+    returns: bool,
+}
+
 /// Returns the indices of the agents that have stood for more than `patience_s` and could go on.
 ///
 /// A vehicle or bicycle in a lane could if no agent is on the path ahead or about to cross it, no
-/// light forbids it, and of those that meet there it has waited longest. A pedestrian could if it
-/// stands on the path of a vehicle or bicycle that has waited as long. `agents` are all of the
+/// light forbids it, and of those whose paths meet there it has waited longest. After twice the time
+/// less room suffices between vehicles that stand across each other's paths. A pedestrian could if
+/// it stands on the path of a vehicle or bicycle that has waited as long. `agents` are all of the
 /// frame.
 pub(super) fn free_to_go(
     map: &MapGraph,
@@ -87,29 +107,60 @@ pub(super) fn free_to_go(
         if reached.is_empty() {
             continue;
         }
-        let holding = |&j: &usize| {
-            let stays = agents[j].waited_s > patience_s;
-            j != i && holds(&reached, agent, &agents[j].agent, stays)
+        let is_held = |room: &Room| {
+            let holding = |&j: &usize| {
+                let stays = agents[j].waited_s > patience_s;
+                j != i && holds(&reached, agent, &agents[j].agent, stays, room)
+            };
+            (0..agents.len()).filter(holding).collect::<Vec<_>>()
         };
-        let in_the_way = waiting.iter().copied().filter(|&j| walks(j));
-        people.extend(in_the_way.filter(holding));
-        if !is_shut(&reached, lights) && !(0..agents.len()).any(|j| holding(&j)) {
-            free.push(i);
+        let holding = is_held(&USUAL);
+        people.extend(holding.iter().copied().filter(|&j| walks(j) && waits(&j)));
+        // Vehicles that have held each other for long squeeze past.
+        let turn =
+            |other: &Agent| angle_difference(agent.state.pose.heading, other.state.pose.heading);
+        let crosses = |j: &usize| waits(j) && !walks(*j) && turn(&agents[*j].agent).abs() > CROSSES;
+        let squeezes = || {
+            let is_long = agents[i].waited_s > 2.0 * patience_s;
+            is_long && holding.iter().all(crosses) && is_held(&TIGHT).is_empty()
+        };
+        if !is_shut(&reached, lights) && (holding.is_empty() || squeezes()) {
+            free.push((i, reached));
         }
     }
-    let goes_first = |i: usize, j: usize| {
-        let (one, other) = (&agents[i], &agents[j]);
-        let (own, its) = (one.agent.state.pose, other.agent.state.pose);
-        let turn = angle_difference(own.heading, its.heading);
+    let goes_first = |(i, own): &(usize, Vec<LaneAhead<'_>>), (j, its): &(usize, Vec<_>)| {
+        let (one, other) = (&agents[*i], &agents[*j]);
+        let (from, of) = (one.agent.state.pose, other.agent.state.pose);
+        let turn = angle_difference(from.heading, of.heading);
         let is_later = (-one.waited_s, one.agent.id) > (-other.waited_s, other.agent.id);
-        turn.abs() > CROSSES && own.position.distance(its.position) < MEETING_M && is_later
+        is_later
+            && turn.abs() > CROSSES
+            && from.position.distance(of.position) < MEETING_M
+            && meet(own, its)
     };
-    let is_next = |i: &usize| !free.iter().any(|&j| goes_first(*i, j));
-    let mut next: Vec<usize> = free.iter().copied().filter(is_next).collect();
+    let is_next = |one: &&(usize, Vec<_>)| !free.iter().any(|other| goes_first(one, other));
+    let mut next: Vec<usize> = free.iter().filter(is_next).map(|(i, _)| *i).collect();
     next.extend(people);
     next.sort_unstable();
     next.dedup();
     next
+}
+
+/// Whether two agents' lanes ahead come within [`NEAR_PATH_M`] of each other.
+fn meet(own: &[LaneAhead<'_>], its: &[LaneAhead<'_>]) -> bool {
+    let on_own = |point: DVec2| {
+        own.iter().any(|part| {
+            let place = part.locate(point);
+            place.beside_m <= NEAR_PATH_M && (0.0..LOOK_M).contains(&place.ahead_m)
+        })
+    };
+    its.iter().any(|part| {
+        let from = (-part.base_m).max(0.0);
+        let to = (LOOK_M - part.base_m).min(part.lane.centerline.length());
+        let steps = ((to - from) / NEAR_PATH_M).max(0.0) as usize;
+        let at = |k: usize| from + NEAR_PATH_M * k as f64;
+        (0..=steps).any(|k| on_own(part.lane.centerline.pose_at(at(k)).position))
+    })
 }
 
 /// The lane that a vehicle or bicycle stands in and those that follow within [`LOOK_M`]; empty for
@@ -156,7 +207,13 @@ fn is_shut(reached: &[LaneAhead<'_>], lights: &[Light]) -> bool {
 
 /// Whether another agent is in the way, or will be when it crosses; one that `stays` is not about to
 /// step onto the path.
-fn holds(reached: &[LaneAhead<'_>], agent: &Agent, other: &Agent, stays: bool) -> bool {
+fn holds(
+    reached: &[LaneAhead<'_>],
+    agent: &Agent,
+    other: &Agent,
+    stays: bool,
+    room: &Room,
+) -> bool {
     let (pose, at) = (other.state.pose, other.state.pose.position);
     let own = agent.state.pose;
     let reach = LOOK_M + agent.length + other.length + GAP_S * other.state.speed();
@@ -165,7 +222,7 @@ fn holds(reached: &[LaneAhead<'_>], agent: &Agent, other: &Agent, stays: bool) -
     }
     let side = match other.kind {
         AgentKind::Pedestrian | AgentKind::Bicycle if !stays => SIDE_OF_PEOPLE_M,
-        _ => SIDE_M,
+        _ => room.beside_m,
     };
     let corners = other.oriented_box().corners();
     let is_ahead = |point: DVec2, beside: f64, metres: f64| {
@@ -177,11 +234,12 @@ fn holds(reached: &[LaneAhead<'_>], agent: &Agent, other: &Agent, stays: bool) -
     // Bicycles keep to the side of their lane; vehicles far from its centre return to it.
     let aside = reached[0].lane.centerline.project(own.position).distance;
     let aside = match agent.kind {
+        _ if !room.returns => 0.0,
         AgentKind::Bicycle => aside.min(BESIDE_M),
         _ => aside.min(IN_LANE_M),
     };
     let mut body = corners.into_iter().chain([at]);
-    if body.any(|point| is_ahead(point, agent.width / 2.0 + side + aside, ROOM_M)) {
+    if body.any(|point| is_ahead(point, agent.width / 2.0 + side + aside, room.ahead_m)) {
         return true;
     }
     let velocity = other.state.velocity;
@@ -291,5 +349,27 @@ mod tests {
         assert_eq!(free(&crossing, &[(0, 9.0), (1, 12.0)]), [1]);
         assert_eq!(free(&crossing, &[(0, 9.0), (1, 9.0)]), [0]);
         assert_eq!(free(&crossing, &[(0, 9.0), (1, 1.0)]), [0]);
+    }
+
+    #[test]
+    fn oncoming_vehicles_do_not_wait_for_each_other() {
+        let road = scenario(
+            "lane 1: 0,0 60,0\nlane 2: 60,4 0,4\n\
+             ego vehicle 0: 20,0\nagent vehicle 1: 35,4 heading 3.1416",
+        );
+        assert_eq!(free(&road, &[(0, 9.0), (1, 12.0)]), [0, 1]);
+    }
+
+    #[test]
+    fn vehicles_that_hold_each_other_squeeze_past_after_twice_the_time() {
+        // Each is in the room that the other would need, 0.2 m beside its path.
+        let crossing = scenario(
+            "lane 1: 0,0 60,0\nlane 2: 30,-40 30,40\n\
+             ego vehicle 0: 26.4,0\nagent vehicle 1: 30,-3.6 heading 1.5708",
+        );
+        assert!(free(&crossing, &[(0, 7.0), (1, 7.0)]).is_empty());
+        assert_eq!(free(&crossing, &[(0, 9.0), (1, 9.0)]), [0]);
+        // One that has just come may move on by itself.
+        assert!(free(&crossing, &[(0, 1.0), (1, 9.0)]).is_empty());
     }
 }

@@ -35,7 +35,7 @@ use crate::relative::engine::{Draw, KEPT, MapMemory, RelativeEngine, Workspace};
 use crate::relative::rules::{
     Driven, StopLine, kinematically_limited, obey_lights, resolve, runs_red, start,
 };
-use crate::relative::seen::{ObservedAgent, add_presents};
+use crate::relative::seen::{FrameIndex, ObservedAgent, add_presents};
 use crate::relative::waiting::{Standing, free_to_go};
 use crate::sampling::SamplingConfig;
 
@@ -54,11 +54,16 @@ const REMEMBERED_S: f64 = 9.0;
 /// many run red lights (result 23).
 const WAITED_S: f64 = 4.0;
 /// An agent that has stood in a lane for longer than this although nothing holds it is shown as
-/// having stood for [`RELEASED_S`], and under rules it is redrawn once if it stays, seconds. Longer
-/// than a benchmark of 8 s shows. Chosen on recorded/tune and SUMO's scenes of a minute (result 23).
+/// seen for the first time, at [`START`], and under rules it is redrawn once if it stays, seconds.
+/// Longer than a benchmark of 8 s shows. Chosen on recorded/tune and SUMO's scenes of a minute
+/// (result 23).
 const PATIENCE_S: f64 = 9.0;
-/// Not varied there: as if it had just stopped, seconds.
-const RELEASED_S: f64 = 1.0;
+/// The speed of such an agent, metres per second. With 2 m/s vehicles start more often than in the
+/// log (result 23).
+const START: f64 = 1.0;
+/// After as many steps, [`PATIENCE_S`], vehicles without a reason to slow down are shown without
+/// their past: see [`View::is_free`](gump_model::relative::graph::View::is_free).
+const LATE: usize = 18;
 /// An agent that was faster than this is not parked, metres per second: more than the jitter of
 /// recorded boxes. Chosen by hand (decision 26).
 const DRIVES: f64 = 2.0;
@@ -338,6 +343,8 @@ struct Future {
     seed: Seed,
     /// Frames read so far.
     frames: usize,
+    /// Frames of the history.
+    history: usize,
     members: Vec<Member>,
     /// Agents that are not predicted.
     others: Vec<Agent>,
@@ -375,6 +382,7 @@ impl Future {
             scene: Arc::clone(scene),
             seed: Seed(0),
             frames: 0,
+            history: frames.len(),
             members: Vec::new(),
             others,
             lights: state.now().lights().to_vec(),
@@ -425,7 +433,11 @@ impl Future {
             let (scene, lights) = (&future.scene, &future.shown_lights);
             let seen = future.members.iter_mut().map(|member| &mut member.seen);
             let map = (&scene.map, &scene.memory);
-            add_presents(map, lights, seen, future.frames, &mut presents);
+            let frame = FrameIndex {
+                t: future.frames,
+                is_late: future.frames >= future.history + LATE,
+            };
+            add_presents(map, lights, seen, frame, &mut presents);
         }
         let mut hidden = Vec::new();
         engine.read(&mut presents, room, &mut hidden);
@@ -477,7 +489,7 @@ impl Future {
         for (i, (future, streams)) in futures.iter_mut().zip(&streams).enumerate() {
             let (own, rest) = drawn.split_at(streams.len());
             let moves = future.moves(engine, sampling, (streams, own), ego(i), room);
-            future.go(&moves, ego(i));
+            future.go(engine, &moves, ego(i));
             drawn = rest;
         }
         Self::read_all(futures, engine, room);
@@ -508,7 +520,7 @@ impl Future {
 
     /// Advances by these moves, which the network has not read yet; a driven ego takes the given
     /// state.
-    fn go(&mut self, moves: &[Pose], ego: Option<AgentState>) {
+    fn go(&mut self, engine: &RelativeEngine, moves: &[Pose], ego: Option<AgentState>) {
         let id = self.scene.ego;
         for (member, &step) in self.members.iter_mut().zip(moves) {
             let driven = ego.filter(|_| member.agent.id == id);
@@ -529,11 +541,11 @@ impl Future {
             light.2 = elapsed.filter(|elapsed| *elapsed <= REMEMBERED_S);
         }
         self.lights_now.clone_from(&self.lights);
-        self.limit_waiting();
+        self.limit_waiting(engine);
     }
 
     /// Limits for how long agents are shown to the network as standing.
-    fn limit_waiting(&mut self) {
+    fn limit_waiting(&mut self, engine: &RelativeEngine) {
         let map = &self.scene.source;
         let mut limits = Vec::with_capacity(self.members.len());
         let mut is_one_waiting = false;
@@ -556,8 +568,10 @@ impl Future {
             });
             let all: Vec<_> = members.chain(others).collect();
             for i in free_to_go(map, &self.lights, &all, PATIENCE_S) {
-                limits[i] = Some(RELEASED_S);
-                self.members[i].could_go = true;
+                let member = &mut self.members[i];
+                member.could_go = true;
+                limits[i] = None;
+                member.seen.restart(engine, START);
             }
         }
         for (member, limit) in self.members.iter_mut().zip(limits) {

@@ -203,6 +203,8 @@ const OF_PAST: usize = KINDS + RELATIVE;
 const OF_NEIGHBOUR: usize = OF_PAST + 1;
 const OF_PATH: usize = OF_NEIGHBOUR + 12;
 const OF_LANE: usize = OF_PATH + 6;
+/// Marks of green, yellow, red and unknown.
+const OF_LIGHT: usize = OF_LANE + 3;
 const OF_GAP: usize = OF_LANE + 10;
 /// The time at which the predicted gap to a neighbour is evaluated, with constant velocities,
 /// seconds: up to [`SOON_S`], as rules look 1.5 s ahead.
@@ -283,6 +285,37 @@ pub struct View {
     pub neighbours: Vec<(usize, EdgeRow)>,
     /// Indices of pieces of the map, with their edges.
     pub pieces: Vec<(u32, EdgeRow)>,
+}
+
+// The limits of a free road were chosen by hand; with 2 and 4 s instead of 3 and 5 s, or 4 and 6 s,
+// as many vehicles stop without a reason (result 23).
+
+/// Vehicles on the paths ahead within this and as many seconds are reasons to slow down, ...
+const ROOM_M: f64 = 10.0;
+const HEADWAY_S: f64 = 3.0;
+/// ... lights that are not green within this many seconds, ...
+const LIGHT_S: f64 = 5.0;
+/// ... and agents whose gap falls below this within [`SOON_S`], metres.
+const GAP_M: f64 = 0.5;
+
+impl View {
+    /// Whether an agent moves and sees nothing to slow down for: nobody on the paths ahead, no
+    /// light that is not green, and nobody about to come near. Bends and the end of the road do not
+    /// count.
+    pub fn is_free(&self, own: &Shown) -> bool {
+        let speed = own.velocity().length();
+        let away = |row: &EdgeRow| 30.0 * f64::from(row[OF_PATH + 3]);
+        let is_on_path = |row: &EdgeRow| row[OF_PATH..][..PATHS].iter().any(|on| *on > 0.0);
+        let holds = |(_, row): &(usize, EdgeRow)| {
+            let is_near = f64::from(row[OF_GAP + 1]) < bend(GAP_M / 0.5);
+            is_near || is_on_path(row) && away(row) < ROOM_M + HEADWAY_S * speed
+        };
+        let shuts = |(_, row): &(u32, EdgeRow)| {
+            let is_shut = row[OF_LIGHT + 1] + row[OF_LIGHT + 2] > 0.0;
+            is_shut && is_on_path(row) && away(row) < ROOM_M + LIGHT_S * speed
+        };
+        !own.stands() && !self.neighbours.iter().any(holds) && !self.pieces.iter().any(shuts)
+    }
 }
 
 /// The edges of agent `i` of those of a frame.
@@ -570,5 +603,45 @@ mod tests {
         let moved = is.then(Pose::new(7.03, 4.98, 1.2));
         assert!((moved.velocity() - DVec2::new(4.0, 0.0)).length() < 1e-9);
         assert_eq!(moved.stood, 0.0);
+    }
+
+    #[test]
+    fn a_road_is_free_without_leaders_lights_and_crossing_agents() {
+        let scenario = gump_scene::fixture::scenario(
+            "lane 1: 0,0 60,0 speed 15 next 2
+             lane 2: 60,0 200,0
+             ego vehicle 0: 10,0 velocity 8,0",
+        )
+        .unwrap();
+        let map = VectorMap::new(&scenario.map, DVec2::ZERO, 300.0, Default::default());
+        let car = |x: f64, y: f64, heading: f64, speed: f64| {
+            let at = Pose::new(x, y, heading);
+            Shown::first(CAR, at, DVec2::from_angle(heading) * speed)
+        };
+        let is_free = |speed: f64, others: &[Shown], light: LightState| {
+            let agents: Vec<Shown> = std::iter::once(car(10.0, 0.0, 0.0, speed))
+                .chain(others.iter().copied())
+                .collect();
+            let lights = Lights {
+                by_lane: vec![(gump_scene::LaneId(2), light, None)],
+            };
+            look(&map, &lights, &agents, 0).is_free(&agents[0])
+        };
+        let green = LightState::Green;
+        assert!(is_free(8.0, &[], green));
+        // Who stands is not on its way.
+        assert!(!is_free(0.0, &[], green));
+        // A leader 20 m ahead, within 34 m; one beside the lane; one far ahead.
+        assert!(!is_free(8.0, &[car(30.0, 0.0, 0.0, 8.0)], green));
+        assert!(is_free(8.0, &[car(30.0, 6.0, 0.0, 0.0)], green));
+        assert!(is_free(4.0, &[car(45.0, 0.0, 0.0, 4.0)], green));
+        // A light 50 m ahead matters at 10 m/s, not at 4.
+        assert!(!is_free(10.0, &[], LightState::Red));
+        assert!(!is_free(10.0, &[], LightState::Yellow));
+        assert!(is_free(4.0, &[], LightState::Red));
+        // A car that crosses in two seconds.
+        let crossing = std::f64::consts::FRAC_PI_2;
+        assert!(!is_free(8.0, &[car(26.0, -16.0, crossing, 8.0)], green));
+        assert!(is_free(8.0, &[car(26.0, 16.0, crossing, 8.0)], green));
     }
 }

@@ -12,7 +12,7 @@
 
 use gump_engine::relative::engine::{Draw, RelativeEngine, Workspace};
 use gump_engine::relative::rules::resolve;
-use gump_engine::relative::seen::{ObservedAgent, add_presents};
+use gump_engine::relative::seen::{FrameIndex, ObservedAgent, add_presents};
 use gump_geometry::{DVec2, Pose, angle_difference};
 use gump_kernels::panels::Precision;
 use gump_model::local_context::LaneMap;
@@ -175,7 +175,8 @@ impl TrackDriver for NetworkDriver {
             let agents: Vec<Shown> = members.iter().flatten().map(ObservedAgent::now).collect();
             let mut read = Vec::new();
             let seen = members.iter_mut().flatten();
-            add_presents((map, &memory), lights, seen, t, &mut read);
+            let frame = FrameIndex { t, is_late: false };
+            add_presents((map, &memory), lights, seen, frame, &mut read);
             self.engine.read(&mut read, &mut room, &mut hidden);
             if t + 1 < WARM_UP {
                 continue;

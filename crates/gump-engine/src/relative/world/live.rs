@@ -86,7 +86,7 @@ impl LiveFuture {
         let mut room = Workspace::default();
         let mut moves = std::mem::take(&mut self.moves);
         moves.resize(self.future.members.len(), Pose::IDENTITY);
-        self.future.go(&moves, ego);
+        self.future.go(&world.engine, &moves, ego);
         self.future.read(&world.engine, &mut room);
         self.future.follow(&world.engine, &world.sampling);
         self.future.frame()
