@@ -10,7 +10,7 @@
 //! `behaviour/free_road.rs` of `gump-metrics`, which counts stops, and `reason.rs` of
 //! `gump-generate`, which rejects draws. All three find lanes and stop lines with `gump-scene`. Here
 //! the question is not whether it makes sense to stand but whether there is room to start, after
-//! nine seconds:
+//! it has stood for long:
 //!
 //! * A light holds unless another way ahead has green, since whoever waits may leave by that. In the
 //!   other two a single light that is not green is a reason.
@@ -70,6 +70,8 @@ pub(super) struct Standing {
     pub(super) agent: Agent,
     /// Time that it has stood, seconds; 0 if it moves.
     pub(super) waited_s: f64,
+    /// Time after which it goes if it could, seconds.
+    pub(super) patience_s: f64,
     /// Whether it was seen to drive: it is not parked, wherever it stands.
     pub(super) has_driven: bool,
 }
@@ -84,20 +86,15 @@ struct Room {
     returns: bool,
 }
 
-/// Returns the indices of the agents that have stood for more than `patience_s` and could go on.
+/// Returns the indices of the agents that have stood for longer than their patience and could go on.
 ///
 /// A vehicle or bicycle in a lane could if no agent is on the path ahead or about to cross it, no
 /// light forbids it, and of those whose paths meet there it has waited longest. After twice the time
 /// less room suffices between vehicles that stand across each other's paths. A pedestrian could if
 /// it stands on the path of a vehicle or bicycle that has waited as long. `agents` are all of the
 /// frame.
-pub(super) fn free_to_go(
-    map: &MapGraph,
-    lights: &[Light],
-    agents: &[Standing],
-    patience_s: f64,
-) -> Vec<usize> {
-    let waits = |i: &usize| agents[*i].waited_s > patience_s;
+pub(super) fn free_to_go(map: &MapGraph, lights: &[Light], agents: &[Standing]) -> Vec<usize> {
+    let waits = |i: &usize| agents[*i].waited_s > agents[*i].patience_s;
     let waiting: Vec<usize> = (0..agents.len()).filter(waits).collect();
     let walks = |i: usize| agents[i].agent.kind == AgentKind::Pedestrian;
     let (mut free, mut people) = (Vec::new(), Vec::new());
@@ -109,7 +106,7 @@ pub(super) fn free_to_go(
         }
         let is_held = |room: &Room| {
             let holding = |&j: &usize| {
-                let stays = agents[j].waited_s > patience_s;
+                let stays = waits(&j);
                 j != i && holds(&reached, agent, &agents[j].agent, stays, room)
             };
             (0..agents.len()).filter(holding).collect::<Vec<_>>()
@@ -121,7 +118,7 @@ pub(super) fn free_to_go(
             |other: &Agent| angle_difference(agent.state.pose.heading, other.state.pose.heading);
         let crosses = |j: &usize| waits(j) && !walks(*j) && turn(&agents[*j].agent).abs() > CROSSES;
         let squeezes = || {
-            let is_long = agents[i].waited_s > 2.0 * patience_s;
+            let is_long = agents[i].waited_s > 2.0 * agents[i].patience_s;
             is_long && holding.iter().all(crosses) && is_held(&TIGHT).is_empty()
         };
         if !is_shut(&reached, lights) && (holding.is_empty() || squeezes()) {
@@ -270,10 +267,11 @@ mod tests {
             .map(|agent| Standing {
                 agent: *agent,
                 waited_s: since(agent.id).map_or(0.0, |(_, s)| *s),
+                patience_s: 4.0,
                 has_driven,
             })
             .collect();
-        let found = free_to_go(scene.map, scene.now().lights(), &agents, 4.0);
+        let found = free_to_go(scene.map, scene.now().lights(), &agents);
         found.into_iter().map(|i| agents[i].agent.id.0).collect()
     }
 

@@ -31,6 +31,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::EngineError;
+use crate::nucleus::uniform;
 use crate::relative::engine::{Draw, KEPT, MapMemory, RelativeEngine, Workspace};
 use crate::relative::rules::{
     Driven, StopLine, kinematically_limited, obey_lights, resolve, runs_red, start,
@@ -53,15 +54,16 @@ const REMEMBERED_S: f64 = 9.0;
 /// vehicles that wait at a junction would look like parked ones and never start. With 1 s, twice as
 /// many run red lights (result 23).
 const WAITED_S: f64 = 4.0;
-/// An agent that has stood in a lane for longer than this although nothing holds it is shown as
-/// seen for the first time, at [`START`], and under rules it is redrawn once if it stays, seconds.
-/// Longer than a benchmark of 8 s shows. Chosen on recorded/tune and SUMO's scenes of a minute
-/// (result 23).
-const PATIENCE_S: f64 = 9.0;
+/// An agent that has stood in a lane for longer than its patience although nothing holds it is shown
+/// as seen for the first time, at [`START`], and under rules it is redrawn once if it stays. Its
+/// patience is drawn evenly between these, seconds: longer than a benchmark of 8 s shows, and so
+/// spread that agents that have stood since the start do not start together. Chosen on recorded/tune
+/// and SUMO's scenes of a minute (result 23).
+const PATIENCE_S: [f64; 2] = [9.0, 27.0];
 /// The speed of such an agent, metres per second. With 2 m/s vehicles start more often than in the
 /// log (result 23).
 const START: f64 = 1.0;
-/// After as many steps, [`PATIENCE_S`], vehicles without a reason to slow down are shown without
+/// After as many steps, nine seconds, vehicles without a reason to slow down are shown without
 /// their past: see [`View::is_free`](gump_model::relative::graph::View::is_free).
 const LATE: usize = 18;
 /// An agent that was faster than this is not parked, metres per second: more than the jitter of
@@ -88,6 +90,8 @@ const TOGETHER: usize = 8;
 const REDRAW: u64 = 1 << 20;
 /// ... and those of predictive samples from both.
 const SAMPLE_STREAMS: u64 = 1 << 40;
+/// The stream of patience, ...
+const PATIENCE: u64 = 1 << 41;
 
 /// Settings of rollouts.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -544,6 +548,13 @@ impl Future {
         self.limit_waiting(engine);
     }
 
+    /// Time after which an agent that stands although nothing holds it goes on, seconds.
+    fn patience_s(&self, member: &Member) -> f64 {
+        let stream = self.seed.fork(PATIENCE).fork(member.agent.id.0 as u64);
+        let [least, most] = PATIENCE_S;
+        least + (most - least) * uniform(stream)
+    }
+
     /// Limits for how long agents are shown to the network as standing.
     fn limit_waiting(&mut self, engine: &RelativeEngine) {
         let map = &self.scene.source;
@@ -551,7 +562,7 @@ impl Future {
         let mut is_one_waiting = false;
         for member in &mut self.members {
             member.could_go = false;
-            is_one_waiting |= member.waited > PATIENCE_S;
+            is_one_waiting |= member.waited > PATIENCE_S[0];
             let is_long = member.waited > WAITED_S && stands_in_lane(map, &member.agent);
             limits.push(is_long.then_some(WAITED_S));
         }
@@ -559,15 +570,17 @@ impl Future {
             let members = self.members.iter().map(|member| Standing {
                 agent: member.agent,
                 waited_s: member.waited,
+                patience_s: self.patience_s(member),
                 has_driven: member.has_driven,
             });
             let others = self.others.iter().map(|&agent| Standing {
                 agent,
                 waited_s: 0.0,
+                patience_s: f64::INFINITY,
                 has_driven: false,
             });
             let all: Vec<_> = members.chain(others).collect();
-            for i in free_to_go(map, &self.lights, &all, PATIENCE_S) {
+            for i in free_to_go(map, &self.lights, &all) {
                 let member = &mut self.members[i];
                 member.could_go = true;
                 limits[i] = None;
