@@ -2,9 +2,9 @@
 # Prints a digest of the results of a fixed set of runs, one a line: what a change of structure alone
 # must leave as it is. Give it a driver: `xtask/digests.sh target/debug/xtask`.
 #
-# Times, rates, memory and paths are left out of what is digested. `xtask/digests-amx.txt` has the digests
-# of processors with AMX: `xtask/digests.sh target/debug/xtask | diff xtask/digests-amx.txt -` shows only its
-# heading there.
+# Times, rates, memory and paths are left out of what is digested. Digests depend on the processor, and a
+# driver reads the data sets of the checkout that it was built in: run the drivers of before and after on
+# one machine, each in its own checkout.
 set -euo pipefail
 driver=$(realpath "${1:?the driver to run, for instance target/debug/xtask}")
 cd "$(dirname "$0")/.."
