@@ -1,9 +1,9 @@
 //! Realism from the outside: what an actor must not know, and the ways of decoding.
 #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
+mod workplace;
+
 use std::fs;
-use std::path::PathBuf;
-use std::process::{Command, Output};
 
 use gump_data::{cache, find, womd};
 use gump_geometry::{DVec2, Pose, dvec2};
@@ -13,31 +13,9 @@ use gump_scene::{
     Agent, AgentId, AgentState, Frame, LaneId, Light, LightState, Scenario, Seed, fixture,
 };
 use serde_json::Value;
-
-/// A folder for one test, and the driver in it.
-struct Workplace {
-    folder: tempfile::TempDir,
-}
+use workplace::Workplace;
 
 impl Workplace {
-    fn new() -> Self {
-        let folder = tempfile::tempdir().unwrap();
-        Self { folder }
-    }
-
-    fn path(&self, name: &str) -> PathBuf {
-        self.folder.path().join(name)
-    }
-
-    fn run(&self, words: &str) -> Output {
-        Command::new(env!("CARGO_BIN_EXE_xtask"))
-            .args(words.split(' '))
-            .current_dir(self.folder.path())
-            .env("CARGO_MANIFEST_DIR", env!("CARGO_MANIFEST_DIR"))
-            .output()
-            .unwrap()
-    }
-
     /// The results of a verb that succeeds.
     fn results(&self, words: &str) -> Value {
         let output = self.run(&format!("{words} --quiet --out out"));

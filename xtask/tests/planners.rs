@@ -2,39 +2,18 @@
 //! and what a report says of its own limits.
 #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
+mod workplace;
+
 use std::fs;
-use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::path::Path;
 
 use gump_model::checkpoint::StorageType;
 use gump_model::{Device, ModelConfig, Network, checkpoint};
 use gump_scene::Seed;
 use serde_json::Value;
-
-/// A folder for one test, and the driver in it.
-struct Workplace {
-    folder: tempfile::TempDir,
-}
+use workplace::Workplace;
 
 impl Workplace {
-    fn new() -> Self {
-        let folder = tempfile::tempdir().unwrap();
-        Self { folder }
-    }
-
-    fn path(&self, name: &str) -> PathBuf {
-        self.folder.path().join(name)
-    }
-
-    fn run(&self, words: &str) -> Output {
-        Command::new(env!("CARGO_BIN_EXE_xtask"))
-            .args(words.split(' '))
-            .current_dir(self.folder.path())
-            .env("CARGO_MANIFEST_DIR", env!("CARGO_MANIFEST_DIR"))
-            .output()
-            .unwrap()
-    }
-
     /// The results of a run that succeeds, and what it printed.
     fn results(&self, words: &str, out: &str) -> (Value, String) {
         let output = self.run(&format!("{words} --out {out}"));

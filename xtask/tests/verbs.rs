@@ -1,11 +1,13 @@
 //! Every verb from the outside: exit status, sentences, files, and the report that scripts rely on.
 #![expect(clippy::unwrap_used, reason = "a test fails by panicking")]
 
+mod workplace;
+
 #[path = "../../tests/shared.rs"]
 mod shared_data;
 
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Command, Output};
 
 use gump_kernels::Kernel;
@@ -15,32 +17,9 @@ use gump_scene::Seed;
 use gump_train::{ModelChoice, RunConfig, TrainConfig};
 use serde_json::Value;
 use shared_data::shared;
-
-/// A folder for one test, and the driver in it.
-struct Workplace {
-    folder: tempfile::TempDir,
-}
+use workplace::Workplace;
 
 impl Workplace {
-    fn new() -> Self {
-        let folder = tempfile::tempdir().unwrap();
-        Self { folder }
-    }
-
-    fn path(&self, name: &str) -> PathBuf {
-        self.folder.path().join(name)
-    }
-
-    /// Runs the driver with space-separated words.
-    fn run(&self, words: &str) -> Output {
-        Command::new(env!("CARGO_BIN_EXE_xtask"))
-            .args(words.split(' '))
-            .current_dir(self.folder.path())
-            .env("CARGO_MANIFEST_DIR", env!("CARGO_MANIFEST_DIR"))
-            .output()
-            .unwrap()
-    }
-
     /// Runs a verb that succeeds and returns its report.
     fn report(&self, words: &str) -> Value {
         let output = self.run(&format!("{words} --out out"));
@@ -934,7 +913,7 @@ fn shards_of_drives_are_the_whole_and_a_stopped_run_goes_on() {
     let shard = |shard: &str, out: &str| {
         Command::new(env!("CARGO_BIN_EXE_xtask"))
             .args(format!("{words} --threads 1 --shard {shard} --out {out}").split(' '))
-            .current_dir(place.folder.path())
+            .current_dir(place.path(""))
             .env("CARGO_MANIFEST_DIR", env!("CARGO_MANIFEST_DIR"))
             .envs([("JOB_COMPLETION_INDEX", "1"), ("GUMP_SHARDS", "2")])
             .output()
