@@ -9,8 +9,8 @@
 //! Two other places ask why a vehicle stands, for other purposes and therefore with other reasons:
 //! `behaviour/free_road.rs` of `gump-metrics`, which counts stops, and `reason.rs` of
 //! `gump-generate`, which rejects draws. All three find lanes and stop lines with `gump-scene`. Here
-//! the question is not whether it makes sense to stand but whether there is room to start, after
-//! it has stood for long:
+//! the question is not whether it makes sense to stand but whether an agent that has stood for long
+//! has room to start:
 //!
 //! * A light holds unless another way ahead has green, since whoever waits may leave by that. In the
 //!   other two a single light that is not green is a reason.

@@ -545,7 +545,7 @@ impl Future {
             light.2 = elapsed.filter(|elapsed| *elapsed <= REMEMBERED_S);
         }
         self.lights_now.clone_from(&self.lights);
-        self.limit_waiting(engine);
+        self.limit_waiting(engine, ego.map(|_| id));
     }
 
     /// Time after which an agent that stands although nothing holds it goes on, seconds.
@@ -555,8 +555,9 @@ impl Future {
         least + (most - least) * uniform(stream)
     }
 
-    /// Limits for how long agents are shown to the network as standing.
-    fn limit_waiting(&mut self, engine: &RelativeEngine) {
+    /// Limits for how long agents are shown to the network as standing. One that is driven from
+    /// outside is shown as it is, and keeps none of those waiting that could go.
+    fn limit_waiting(&mut self, engine: &RelativeEngine, driven: Option<AgentId>) {
         let map = &self.scene.source;
         let mut limits = Vec::with_capacity(self.members.len());
         let mut is_one_waiting = false;
@@ -570,7 +571,10 @@ impl Future {
             let members = self.members.iter().map(|member| Standing {
                 agent: member.agent,
                 waited_s: member.waited,
-                patience_s: self.patience_s(member),
+                patience_s: match driven == Some(member.agent.id) {
+                    true => f64::INFINITY,
+                    false => self.patience_s(member),
+                },
                 has_driven: member.has_driven,
             });
             let others = self.others.iter().map(|&agent| Standing {

@@ -200,4 +200,23 @@ mod tests {
         assert_eq!(ways[0], ways[1]);
         assert_ne!(ways[0], ways[2]);
     }
+
+    #[test]
+    fn an_ego_that_is_driven_is_shown_as_it_is_however_long_it_stands() {
+        let road = "lane 1: 0,0 160,0 speed 15\nego vehicle 0: 10,0";
+        let (world, scenario) = (world(), fixture::scenario(road).unwrap());
+        let scene = scenario.present();
+        let mut live = LiveFuture::begin(&world, scene, Seed(4)).unwrap();
+        let stands = scene.ego_now().state;
+        // Half a minute, longer than any agent's patience, on a free road.
+        for _ in 0..60 {
+            live.go_on(&world, Some(stands));
+        }
+        let ego = &live.future.members[0];
+        assert!(ego.waited >= 30.0 && !ego.could_go, "{}", ego.waited);
+        assert_eq!(ego.now().velocity(), DVec2::ZERO);
+        // Left to the network from here on, it is one that could drive on.
+        live.go_on(&world, None);
+        assert!(live.future.members[0].could_go);
+    }
 }
