@@ -13,7 +13,7 @@ use gump_engine::{CacheMode, LightSource, Mode, Precision};
 use gump_generate::Placement;
 use gump_nuplan::closed_loop::Tracking;
 use gump_planner::{Aggregate, Allocation};
-use gump_rl::sac::Algorithm;
+use gump_rl::Algorithm;
 use gump_wosac::motion::ShapeRules;
 use gump_wosac::realism::Year;
 
@@ -99,10 +99,14 @@ pub(crate) const PLACEMENTS: [(Placement, &str); 2] = [
 ];
 
 /// Algorithms of reinforcement learning.
-pub(crate) const ALGORITHMS: [(Algorithm, &str); 2] = [
+pub(crate) const ALGORITHMS: [(Algorithm, &str); 3] = [
     (
         Algorithm::Sac,
         "Soft actor-critic: rewards, and a share of expert transitions",
+    ),
+    (
+        Algorithm::Ppo,
+        "Proximal policy optimization: imitation, then rewards; many steps of the world",
     ),
     (Algorithm::Imitation, "Imitation of the log's actions"),
 ];

@@ -7,7 +7,10 @@ use std::process::{Command, Output};
 
 use serde_json::Value;
 
-const CONFIG: &str = "[env]\nn_envs = 4\n[sac]\nsteps = 40\nbatch = 16\nhidden = [16]\n\
+const CONFIG: &str = "[env]\nn_envs = 4\n\
+                      [ppo]\nrounds = 40\nunroll = 4\nbatch = 8\nhidden = [16]\nsegment = 20\n\
+                      critic_rounds = 5\nimitation_steps = 20\nimitation_weight = 0.1\n\
+                      [sac]\nsteps = 40\nbatch = 16\nhidden = [16]\n\
                       initial_steps = 40\nsegment = 20\nreplay_capacity = 100\n";
 
 /// A folder for one test with a scene and a configuration.
@@ -77,7 +80,7 @@ const TRAIN: &str = "rl train --scenarios scene.tfrecord --algorithm";
 #[test]
 fn a_policy_learns_goes_on_and_is_evaluated() {
     let place = Workplace::new();
-    for words in ["sac --train-world idm", "imitation"] {
+    for words in ["sac --train-world idm", "ppo", "imitation"] {
         let whole = place.results(&format!("{TRAIN} {words}"), "whole");
         assert_eq!(
             (&whole["steps"], &whole["scenarios"]),

@@ -4,9 +4,9 @@ use std::borrow::Cow;
 
 use gump_scene::{Rng, Seed, standard_normal};
 
-use crate::ObservationForm;
 use crate::networks::{ConvNet, ConvPass, Mlp, Normalizer, Pass};
 use crate::sac::{SacConfig, Squashed};
+use crate::{ObservationForm, RlError, VectorEnv};
 
 /// Preprocessing of observations, and a network that outputs mean and log standard deviation of
 /// every component of an action.
@@ -142,6 +142,28 @@ impl Actor {
         dimensions
             .map(|d| choose(self.dimension(d)) as f32)
             .collect()
+    }
+
+    /// Error: [`RlError::Shape`] for an environment with other observations or actions.
+    pub(crate) fn check_shape(&self, env: &dyn VectorEnv) -> Result<(), RlError> {
+        let pairs = [
+            (
+                "observations",
+                self.observation_len(),
+                env.observation_len(),
+            ),
+            ("actions", self.action_len(), env.action_len()),
+        ];
+        for (what, expected, found) in pairs {
+            if expected != found {
+                return Err(RlError::Shape {
+                    what,
+                    expected,
+                    found,
+                });
+            }
+        }
+        Ok(())
     }
 
     /// The distribution with these two network outputs.

@@ -3,6 +3,8 @@
 use gump_rollout::BoxError;
 use gump_scene::{AgentId, ScenarioError};
 
+use crate::Algorithm;
+
 /// Why an environment or a buffer could not do what was requested.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -119,10 +121,16 @@ pub enum RlError {
         /// Their length.
         found: usize,
     },
+    /// An algorithm that another module implements.
+    #[error("this run cannot learn by {algorithm}")]
+    OtherAlgorithm {
+        /// The algorithm.
+        algorithm: Algorithm,
+    },
     /// A number of a run is NaN or infinite.
     #[error("learning diverged at gradient step {step}: {what} is not finite")]
     Diverged {
-        /// The gradient step, 0 before the first one.
+        /// The gradient step, 0 before the first one; of PPO the round.
         step: usize,
         /// What is not finite.
         what: String,

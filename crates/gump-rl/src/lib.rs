@@ -3,8 +3,8 @@
 //! Start with [`DrivingEnv`]: many episodes in parallel, with one batched call of the world per
 //! step. It implements [`VectorEnv`], the only interface that learning algorithms need. [`PreparedScenario`]
 //! is a prepared scenario, [`Dynamics`] defines actions, [`ObservationSpec`] observations and
-//! [`RewardWeights`] the reward. [`Rules`] is one episode as pure functions. [`sac`] trains an
-//! [`Actor`] from rewards or from experts. On Unix, [`server`] provides environments to other
+//! [`RewardWeights`] the reward. [`Rules`] is one episode as pure functions. [`ppo`] and [`sac`]
+//! train an [`Actor`] from rewards, [`sac`] also from experts alone. On Unix, [`server`] provides environments to other
 //! processes.
 //!
 //! # Terms
@@ -31,6 +31,7 @@
 //! ```
 
 mod actor;
+mod algorithm;
 mod dynamics;
 mod env;
 mod episode;
@@ -39,6 +40,7 @@ mod evaluate;
 mod imitation;
 pub mod networks;
 mod observation;
+pub mod ppo;
 mod prepared_scenario;
 pub mod sac;
 #[cfg(unix)]
@@ -46,6 +48,7 @@ pub mod server;
 mod vector_env;
 
 pub use actor::Actor;
+pub use algorithm::Algorithm;
 pub use dynamics::{BicycleLimits, Dynamics, PoseLimits};
 pub use env::{Autoreset, DrivingEnv, EnvConfig, EpisodeStart, Outcome, Sampling, TrafficSource};
 pub use episode::{End, EpisodeState, Failure, RewardWeights, Rules, Totals};

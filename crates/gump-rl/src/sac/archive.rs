@@ -10,11 +10,11 @@ use serde::{Deserialize, Serialize};
 
 use super::replay_buffer::{ReplayBuffer, Store};
 use super::tensors::{Reader, Writer, check_len, wrong};
-use super::training::{Algorithm, Training};
+use super::training::Training;
 use super::{Learner, SacConfig};
 use crate::actor::Perception;
 use crate::networks::{Architecture, ConvNet, Mlp, Normalizer, Picture};
-use crate::{Actor, ObservationForm, RlError};
+use crate::{Actor, Algorithm, ObservationForm, RlError};
 
 /// Version of the layout.
 const FORMAT: &str = "gump-rl-1";
@@ -56,7 +56,7 @@ struct RunHeader {
 }
 
 #[derive(Debug, Serialize, Deserialize)]
-struct BufferHeader {
+pub(crate) struct BufferHeader {
     capacity: usize,
     head: usize,
     observation_len: usize,
@@ -67,7 +67,7 @@ struct BufferHeader {
 }
 
 impl BufferHeader {
-    fn of(buffer: &ReplayBuffer) -> Self {
+    pub(crate) fn of(buffer: &ReplayBuffer) -> Self {
         Self {
             capacity: buffer.capacity,
             head: buffer.head,
@@ -232,7 +232,7 @@ impl Training {
 }
 
 impl Writer {
-    fn buffer(&mut self, name: &str, buffer: &ReplayBuffer) {
+    pub(crate) fn buffer(&mut self, name: &str, buffer: &ReplayBuffer) {
         self.store(&format!("{name}.observations"), &buffer.observations);
         self.floats(&format!("{name}.actions"), &buffer.actions);
         self.floats(&format!("{name}.rewards"), &buffer.rewards);
@@ -242,7 +242,11 @@ impl Writer {
             .insert(format!("{name}.terminated"), (Dtype::U8, terminated));
     }
 
-    fn actor(&mut self, actor: &Actor, notes: &BTreeMap<String, String>) -> Result<(), RlError> {
+    pub(crate) fn actor(
+        &mut self,
+        actor: &Actor,
+        notes: &BTreeMap<String, String>,
+    ) -> Result<(), RlError> {
         self.floats("actor.parameters", actor.network.parameters());
         let encoder = match &actor.perception {
             Perception::Scaled(normalizer) => {
@@ -270,7 +274,11 @@ impl Writer {
 }
 
 impl Reader<'_> {
-    fn buffer(&self, name: &str, header: &BufferHeader) -> Result<ReplayBuffer, RlError> {
+    pub(crate) fn buffer(
+        &self,
+        name: &str,
+        header: &BufferHeader,
+    ) -> Result<ReplayBuffer, RlError> {
         let BufferHeader {
             capacity,
             head,
@@ -322,7 +330,7 @@ impl Reader<'_> {
         Ok(buffer)
     }
 
-    fn actor(&mut self) -> Result<(Actor, BTreeMap<String, String>), RlError> {
+    pub(crate) fn actor(&mut self) -> Result<(Actor, BTreeMap<String, String>), RlError> {
         let header: PolicyHeader = self.header("policy")?;
         if header.format != FORMAT {
             let found = header.format;

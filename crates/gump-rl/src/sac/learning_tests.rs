@@ -10,7 +10,8 @@ use super::replay_buffer::{ReplayBuffer, Transition};
 use super::test_envs::{
     Bandit, Clock, Identity, Pendulum, Problem, Reach, Regulator, SeenReach, Toy,
 };
-use super::{Algorithm, SacConfig, StepReport, Training};
+use super::{SacConfig, StepReport, Training};
+use crate::Algorithm;
 use crate::networks::Architecture;
 
 /// Small networks and large steps, as small problems want them.

@@ -3,21 +3,21 @@
 //! Start with [`Training`], which collects transitions and learns; [`Learner`] is one gradient
 //! step, [`SacConfig`] the hyperparameters, [`Squashed`] the distribution of an action.
 
-mod archive;
+pub(crate) mod archive;
 mod batch;
 mod config;
 mod critics;
 mod learner;
-mod replay_buffer;
+pub(crate) mod replay_buffer;
 mod squashed;
-mod tensors;
+pub(crate) mod tensors;
 mod training;
 mod vision;
 
 #[cfg(test)]
 mod learning_tests;
 #[cfg(test)]
-mod test_envs;
+pub(crate) mod test_envs;
 #[cfg(test)]
 mod tests;
 #[cfg(test)]
@@ -29,4 +29,4 @@ pub use critics::{Critic, critic_loss, soft_target};
 pub use learner::{Learner, UpdateReport};
 pub use replay_buffer::{ReplayBuffer, Transition};
 pub use squashed::{Draw, Squashed};
-pub use training::{Algorithm, Episode, StepReport, Training};
+pub use training::{Episode, StepReport, Training};

@@ -14,14 +14,14 @@ use crate::networks::Adam;
 /// The header entry that everything but tensors is in.
 const HEADER: &str = "gump";
 
-pub(super) fn wrong(what: impl Into<String>) -> RlError {
+pub(crate) fn wrong(what: impl Into<String>) -> RlError {
     RlError::Archive { what: what.into() }
 }
 
 /// Tensors and header entries to be written.
 #[derive(Default)]
-pub(super) struct Writer {
-    pub(super) tensors: BTreeMap<String, (Dtype, Vec<u8>)>,
+pub(crate) struct Writer {
+    pub(crate) tensors: BTreeMap<String, (Dtype, Vec<u8>)>,
     /// One JSON object, so that the bytes do not depend on the order of a hash map.
     header: serde_json::Map<String, serde_json::Value>,
     /// The first tensor with a number that is NaN or infinite.
@@ -30,11 +30,11 @@ pub(super) struct Writer {
 
 impl Writer {
     /// Name of the first tensor with a number that is NaN or infinite.
-    pub(super) fn not_finite(&self) -> Option<&str> {
+    pub(crate) fn not_finite(&self) -> Option<&str> {
         self.not_finite.as_deref()
     }
 
-    pub(super) fn floats(&mut self, name: &str, values: &[f32]) {
+    pub(crate) fn floats(&mut self, name: &str, values: &[f32]) {
         if self.not_finite.is_none() && !values.iter().all(|value| value.is_finite()) {
             self.not_finite = Some(name.to_owned());
         }
@@ -42,12 +42,12 @@ impl Writer {
         self.tensors.insert(name.to_owned(), (Dtype::F32, bytes));
     }
 
-    pub(super) fn adam(&mut self, name: &str, adam: &Adam) {
+    pub(crate) fn adam(&mut self, name: &str, adam: &Adam) {
         self.floats(&format!("{name}.adam.mean"), &adam.mean);
         self.floats(&format!("{name}.adam.square"), &adam.square);
     }
 
-    pub(super) fn store(&mut self, name: &str, store: &Store) {
+    pub(crate) fn store(&mut self, name: &str, store: &Store) {
         match store {
             Store::Numbers(numbers) => self.floats(name, numbers),
             Store::Bits(bytes) => {
@@ -57,13 +57,13 @@ impl Writer {
         }
     }
 
-    pub(super) fn header(&mut self, name: &str, value: &impl Serialize) -> Result<(), RlError> {
+    pub(crate) fn header(&mut self, name: &str, value: &impl Serialize) -> Result<(), RlError> {
         let value = serde_json::to_value(value).map_err(|error| wrong(error.to_string()))?;
         self.header.insert(name.to_owned(), value);
         Ok(())
     }
 
-    pub(super) fn finish(self) -> Result<Vec<u8>, RlError> {
+    pub(crate) fn finish(self) -> Result<Vec<u8>, RlError> {
         let mut views = Vec::with_capacity(self.tensors.len());
         for (name, (kind, bytes)) in &self.tensors {
             let width = if *kind == Dtype::F32 { 4 } else { 1 };
@@ -77,13 +77,13 @@ impl Writer {
 }
 
 /// A file being read.
-pub(super) struct Reader<'a> {
+pub(crate) struct Reader<'a> {
     tensors: SafeTensors<'a>,
     header: serde_json::Map<String, serde_json::Value>,
 }
 
 impl<'a> Reader<'a> {
-    pub(super) fn new(bytes: &'a [u8]) -> Result<Self, RlError> {
+    pub(crate) fn new(bytes: &'a [u8]) -> Result<Self, RlError> {
         let tensors = SafeTensors::deserialize(bytes).map_err(|error| {
             wrong(format!(
                 "expected a safetensors file, found something else ({error})"
@@ -98,14 +98,14 @@ impl<'a> Reader<'a> {
         Ok(Self { tensors, header })
     }
 
-    pub(super) fn header<T: DeserializeOwned>(&mut self, name: &str) -> Result<T, RlError> {
+    pub(crate) fn header<T: DeserializeOwned>(&mut self, name: &str) -> Result<T, RlError> {
         let value = self.header.remove(name);
         let value = value.ok_or_else(|| wrong(format!("it holds no {name}")))?;
         serde_json::from_value(value)
             .map_err(|error| wrong(format!("its {name} is not valid ({error})")))
     }
 
-    pub(super) fn bytes(&self, name: &str, kind: Dtype) -> Result<&'a [u8], RlError> {
+    pub(crate) fn bytes(&self, name: &str, kind: Dtype) -> Result<&'a [u8], RlError> {
         let tensor = self.tensors.tensor(name);
         let tensor = tensor.map_err(|_| wrong(format!("it has no tensor \"{name}\"")))?;
         if tensor.dtype() == kind {
@@ -117,7 +117,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    pub(super) fn floats(&self, name: &str) -> Result<Vec<f32>, RlError> {
+    pub(crate) fn floats(&self, name: &str) -> Result<Vec<f32>, RlError> {
         let bytes = self.bytes(name, Dtype::F32)?.chunks_exact(4);
         Ok(bytes
             .map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]))
@@ -125,21 +125,21 @@ impl<'a> Reader<'a> {
     }
 
     /// As many numbers as there is room for.
-    pub(super) fn fill(&self, name: &str, room: &mut [f32]) -> Result<(), RlError> {
+    pub(crate) fn fill(&self, name: &str, room: &mut [f32]) -> Result<(), RlError> {
         let values = self.floats(name)?;
         check_len(name, room.len(), values.len())?;
         room.copy_from_slice(&values);
         Ok(())
     }
 
-    pub(super) fn adam(&self, name: &str, adam: &mut Adam, steps: u64) -> Result<(), RlError> {
+    pub(crate) fn adam(&self, name: &str, adam: &mut Adam, steps: u64) -> Result<(), RlError> {
         adam.steps = steps;
         self.fill(&format!("{name}.adam.mean"), &mut adam.mean)?;
         self.fill(&format!("{name}.adam.square"), &mut adam.square)
     }
 }
 
-pub(super) fn check_len(name: &str, expected: usize, found: usize) -> Result<(), RlError> {
+pub(crate) fn check_len(name: &str, expected: usize, found: usize) -> Result<(), RlError> {
     if expected == found {
         Ok(())
     } else {

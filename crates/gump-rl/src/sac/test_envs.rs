@@ -11,7 +11,7 @@ use crate::networks::Picture;
 use crate::{ObservationForm, RlError, VectorEnv};
 
 /// A problem of one environment; states are a few numbers, the last of them may count steps.
-pub(super) trait Problem {
+pub(crate) trait Problem {
     const OBSERVATION: usize;
     const ACTION: usize;
     /// Steps until an episode is cut off.
@@ -28,7 +28,7 @@ pub(super) trait Problem {
 }
 
 /// A problem many times side by side.
-pub(super) struct Toy<P> {
+pub(crate) struct Toy<P> {
     problem: P,
     rng: Rng,
     states: Vec<(Vec<f64>, usize)>,
@@ -40,7 +40,7 @@ pub(super) struct Toy<P> {
 }
 
 impl<P: Problem> Toy<P> {
-    pub(super) fn new(problem: P, n: usize) -> Self {
+    pub(crate) fn new(problem: P, n: usize) -> Self {
         let mut toy = Self {
             problem,
             rng: Seed(0).rng(),
@@ -63,7 +63,7 @@ impl<P: Problem> Toy<P> {
     }
 
     /// Mean over environments of the total reward of one episode each, by the policy's modes.
-    pub(super) fn play(&mut self, seed: Seed, policy: impl Fn(&[f32]) -> Vec<f32>) -> f64 {
+    pub(crate) fn play(&mut self, seed: Seed, policy: impl Fn(&[f32]) -> Vec<f32>) -> f64 {
         self.reset(seed).expect("a toy accepts every action");
         let mut total = 0.0;
         for _ in 0..P::HORIZON {
@@ -139,7 +139,7 @@ impl<P: Problem> VectorEnv for Toy<P> {
 }
 
 /// Do what you see, once.
-pub(super) struct Identity;
+pub(crate) struct Identity;
 
 impl Problem for Identity {
     const OBSERVATION: usize = 1;
@@ -160,7 +160,7 @@ impl Problem for Identity {
 }
 
 /// Go to the origin of the plane; a step is at most 0.2 along each axis.
-pub(super) struct Reach;
+pub(crate) struct Reach;
 
 impl Problem for Reach {
     const OBSERVATION: usize = 2;
@@ -184,7 +184,7 @@ impl Problem for Reach {
 }
 
 /// [`Reach`], seen from above: a square of four pixels, and nothing else.
-pub(super) struct SeenReach;
+pub(crate) struct SeenReach;
 
 impl SeenReach {
     /// Pixels of 0.2.
@@ -223,7 +223,7 @@ impl Problem for SeenReach {
 }
 
 /// The reward is `-(a - 0.3)^2`, once.
-pub(super) struct Bandit;
+pub(crate) struct Bandit;
 
 impl Problem for Bandit {
     const OBSERVATION: usize = 1;
@@ -244,9 +244,9 @@ impl Problem for Bandit {
 }
 
 /// A constant reward for five steps; then the episode is over for good, or cut off.
-pub(super) struct Clock {
-    pub(super) reward: f64,
-    pub(super) terminates: bool,
+pub(crate) struct Clock {
+    pub(crate) reward: f64,
+    pub(crate) terminates: bool,
 }
 
 impl Problem for Clock {
@@ -274,7 +274,7 @@ impl Problem for Clock {
 }
 
 /// `s' = s + a`, reward `-(s^2 + 0.1 a^2)`.
-pub(super) struct Regulator;
+pub(crate) struct Regulator;
 
 impl Problem for Regulator {
     const OBSERVATION: usize = 1;
@@ -301,7 +301,7 @@ impl Problem for Regulator {
 ///
 /// Source: Gymnasium's Pendulum-v1: gravity 10, mass and length 1, steps of 0.05 s, torque within
 /// ±2, speed within ±8, 200 steps.
-pub(super) struct Pendulum;
+pub(crate) struct Pendulum;
 
 impl Problem for Pendulum {
     const OBSERVATION: usize = 3;

@@ -9,7 +9,8 @@ use gump_scene::Seed;
 
 use super::replay_buffer::{ReplayBuffer, Transition};
 use super::test_envs::{Clock, Reach, Toy};
-use super::{Algorithm, Batch, Learner, SacConfig, StepReport, Training};
+use super::{Batch, Learner, SacConfig, StepReport, Training};
+use crate::Algorithm;
 use crate::networks::Normalizer;
 use crate::{Actor, RlError, VectorEnv};
 
@@ -287,8 +288,8 @@ fn go_on(training: &mut Training, segments: usize) -> Vec<StepReport> {
             ControlFlow::Continue(())
         };
         match training.algorithm() {
-            Algorithm::Sac => training.segment(&mut env, keep).unwrap(),
             Algorithm::Imitation => training.imitation_segment(keep).unwrap(),
+            _ => training.segment(&mut env, keep).unwrap(),
         }
     }
     reports
@@ -323,8 +324,8 @@ fn how_it_ends(run: &mut Training, env: &mut dyn VectorEnv) -> RlError {
     for _ in 0..run.config().steps {
         let none = |_| ControlFlow::Continue(());
         let segment = match run.algorithm() {
-            Algorithm::Sac => run.segment(env, none),
             Algorithm::Imitation => run.imitation_segment(none),
+            _ => run.segment(env, none),
         };
         if let Err(error) = segment.and_then(|()| run.to_bytes(&BTreeMap::new())) {
             return error;
@@ -443,6 +444,8 @@ fn damaged_files_are_refused() {
 #[test]
 fn what_does_not_fit_is_refused() {
     let nothing = || ReplayBuffer::new(1, 2, 2).unwrap();
+    let other = Training::new(Algorithm::Ppo, config(), experts(), Seed(0));
+    assert!(matches!(other, Err(RlError::OtherAlgorithm { .. })));
     let empty = Training::new(Algorithm::Imitation, config(), nothing(), Seed(0));
     assert!(matches!(empty, Err(RlError::EmptyBuffer { .. })));
     let narrow = ReplayBuffer::new(1, 3, 2).unwrap();

@@ -1,55 +1,16 @@
 //! Training runs: collecting and learning alternate, in segments between which a run can be
 //! resumed.
 
-use std::fmt;
 use std::ops::ControlFlow;
-use std::str::FromStr;
 
 use gump_scene::Seed;
 use rand::Rng as _;
-use serde::de::IntoDeserializer as _;
-use serde::de::value::Error as NameError;
-use serde::{Deserialize, Serialize};
 
 use super::replay_buffer::{ReplayBuffer, Transition};
 use super::{Batch, Learner, SacConfig, UpdateReport};
 use crate::actor::Perception;
 use crate::networks::Normalizer;
-use crate::{Actor, ObservationForm, RlError, VectorEnv};
-
-/// The training signal.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-#[non_exhaustive]
-pub enum Algorithm {
-    /// Rewards, with a share of expert transitions.
-    Sac,
-    /// Expert transitions only; no environment is needed.
-    Imitation,
-}
-
-impl Algorithm {
-    /// All of them, in the order of declaration.
-    pub const ALL: [Self; 2] = [Self::Sac, Self::Imitation];
-}
-
-impl fmt::Display for Algorithm {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        self.serialize(f)
-    }
-}
-
-impl FromStr for Algorithm {
-    type Err = NameError;
-
-    /// Finds a value by the name that it is stored and displayed under.
-    ///
-    /// # Errors
-    /// A sentence with the unknown name and the known ones.
-    fn from_str(name: &str) -> Result<Self, NameError> {
-        Self::deserialize(name.into_deserializer())
-    }
-}
+use crate::{Actor, Algorithm, ObservationForm, RlError, VectorEnv};
 
 /// A run: the learner, its replay buffer and its progress.
 ///
@@ -81,6 +42,20 @@ pub struct Episode {
     pub terminated: bool,
 }
 
+impl Episode {
+    /// Adds the last step of all environments to their episodes; those that ended go to `finished`.
+    pub(crate) fn advance(running: &mut [Self], env: &dyn VectorEnv, finished: &mut Vec<Self>) {
+        for (i, episode) in running.iter_mut().enumerate() {
+            episode.total += f64::from(env.rewards()[i]);
+            episode.steps += 1;
+            episode.terminated = env.terminated()[i];
+            if episode.terminated || env.truncated()[i] {
+                finished.push(std::mem::take(episode));
+            }
+        }
+    }
+}
+
 /// Progress and statistics of one gradient step.
 #[derive(Clone, Debug, PartialEq)]
 pub struct StepReport {
@@ -109,7 +84,8 @@ impl Training {
     ///
     /// # Errors
     /// [`RlError::Parameter`] for a configuration out of range; [`RlError::NoPicture`] for an
-    /// encoder of pictures over numbers; [`RlError::EmptyBuffer`] for imitation without experts.
+    /// encoder of pictures over numbers; [`RlError::EmptyBuffer`] for imitation without experts;
+    /// [`RlError::OtherAlgorithm`] for [`Algorithm::Ppo`], which is [`crate::ppo`]'s.
     pub fn new(
         algorithm: Algorithm,
         config: SacConfig,
@@ -117,6 +93,9 @@ impl Training {
         seed: Seed,
     ) -> Result<Self, RlError> {
         config.check()?;
+        if algorithm == Algorithm::Ppo {
+            return Err(RlError::OtherAlgorithm { algorithm });
+        }
         if algorithm == Algorithm::Imitation && expert.is_empty() {
             return Err(RlError::EmptyBuffer {
                 requested: config.batch,
@@ -219,7 +198,7 @@ impl Training {
         env: &mut dyn VectorEnv,
         mut observe: impl FnMut(StepReport) -> ControlFlow<()>,
     ) -> Result<(), RlError> {
-        check_shape(env, self.actor())?;
+        self.actor().check_shape(env)?;
         let end = self.end_of_segment();
         env.reset(fork(self.seed, Purpose::Episodes, self.steps() as u64))?;
         self.running = vec![Episode::default(); env.n_envs()];
@@ -295,14 +274,8 @@ impl Training {
                 next: env.final_observations()[i * o..][..o].into(),
                 terminated,
             });
-            let episode = &mut self.running[i];
-            episode.total += f64::from(reward);
-            episode.steps += 1;
-            episode.terminated = terminated;
-            if terminated || env.truncated()[i] {
-                self.finished.push(std::mem::take(episode));
-            }
         }
+        Episode::advance(&mut self.running, env, &mut self.finished);
         self.env_steps += env.n_envs() as u64;
         Ok(())
     }
@@ -314,8 +287,8 @@ impl Training {
         let n = learner.config.batch;
         let n_imitated = match self.algorithm {
             Algorithm::Imitation => n,
-            Algorithm::Sac if self.expert.is_empty() => 0,
-            Algorithm::Sac => learner.config.n_imitated(),
+            _ if self.expert.is_empty() => 0,
+            _ => learner.config.n_imitated(),
         };
         batch.draw(
             (&self.replay, n - n_imitated),
@@ -325,7 +298,7 @@ impl Training {
         )?;
         let update = match self.algorithm {
             Algorithm::Imitation => learner.imitate(batch),
-            Algorithm::Sac => learner.update(batch, fork(self.seed, Purpose::Noise, step)),
+            _ => learner.update(batch, fork(self.seed, Purpose::Noise, step)),
         };
         if !(update.critic_loss + update.actor_loss + update.imitation_loss).is_finite() {
             return Err(self.diverged("a loss"));
@@ -366,24 +339,4 @@ impl Training {
 
 fn fork(seed: Seed, purpose: Purpose, k: u64) -> Seed {
     seed.fork(purpose as u64).fork(k)
-}
-
-fn check_shape(env: &dyn VectorEnv, actor: &Actor) -> Result<(), RlError> {
-    for (what, expected, found) in [
-        (
-            "observations",
-            actor.observation_len(),
-            env.observation_len(),
-        ),
-        ("actions", actor.action_len(), env.action_len()),
-    ] {
-        if expected != found {
-            return Err(RlError::Shape {
-                what,
-                expected,
-                found,
-            });
-        }
-    }
-    Ok(())
 }

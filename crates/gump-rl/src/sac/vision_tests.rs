@@ -11,7 +11,8 @@ use rand::Rng as _;
 use super::replay_buffer::{ReplayBuffer, Transition};
 use super::test_envs::{Problem as _, Reach, SeenReach, Toy};
 use super::tests::check_gradient;
-use super::{Algorithm, Batch, Learner, SacConfig, Training, UpdateReport};
+use super::{Batch, Learner, SacConfig, Training, UpdateReport};
+use crate::Algorithm;
 use crate::networks::{Architecture, Picture};
 use crate::{Actor, RlError};
 
@@ -161,8 +162,8 @@ fn experts() -> ReplayBuffer {
 fn segment(training: &mut Training) {
     let go_on = |_| ControlFlow::Continue(());
     match training.algorithm() {
-        Algorithm::Sac => training.segment(&mut Toy::new(SeenReach, 4), go_on),
         Algorithm::Imitation => training.imitation_segment(go_on),
+        _ => training.segment(&mut Toy::new(SeenReach, 4), go_on),
     }
     .unwrap();
 }

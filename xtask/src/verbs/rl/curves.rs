@@ -4,12 +4,13 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use anyhow::Context as _;
+use gump_rl::ppo::PpoReport;
 use gump_rl::sac::{Episode, StepReport};
 use gump_viz::{Chart, Series};
 
 use super::write;
 
-const N_COLUMNS: usize = 15;
+const N_COLUMNS: usize = 17;
 const HEADER: [&str; N_COLUMNS] = [
     "step",
     "env_steps",
@@ -26,6 +27,8 @@ const HEADER: [&str; N_COLUMNS] = [
     "learning_rate",
     "reward_gradient",
     "imitation_gradient",
+    "divergence",
+    "clipped",
 ];
 
 /// Index of a column of [`HEADER`].
@@ -125,8 +128,37 @@ impl Curves {
             last.update.learning_rate,
             of_updates(|r| r.update.reward_gradient),
             of_updates(|r| r.update.imitation_gradient),
+            f64::NAN,
+            f64::NAN,
         ]);
         self.open.clear();
+    }
+
+    /// Adds a round of PPO, which is a point of its own; it has no temperature and no value.
+    pub(super) fn push_round(&mut self, report: &PpoReport) {
+        let (episodes, update) = (&report.episodes, &report.update);
+        let of_episodes = |value: fn(&Episode) -> f64| {
+            episodes.iter().map(value).sum::<f64>() / episodes.len() as f64
+        };
+        self.rows.push([
+            report.round as f64,
+            report.env_steps as f64,
+            episodes.len() as f64,
+            of_episodes(|e| e.total),
+            of_episodes(|e| e.steps as f64),
+            of_episodes(|e| f64::from(u8::from(e.terminated))),
+            update.critic_loss,
+            f64::NAN,
+            update.imitation_loss,
+            update.entropy,
+            f64::NAN,
+            f64::NAN,
+            report.learning_rate,
+            f64::NAN,
+            f64::NAN,
+            update.divergence,
+            update.clipped,
+        ]);
     }
 
     /// Mean return over the first and the last tenth of the episodes' windows, and how many

@@ -7,6 +7,7 @@ pub(crate) mod train;
 
 pub(crate) mod columns;
 mod curves;
+mod learner;
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -19,8 +20,9 @@ use gump_eval::datasets::{self, Manifest, Part, Split};
 use gump_eval::worlds::{World, WorldName};
 use gump_model::Device;
 use gump_rl::networks::Architecture;
+use gump_rl::ppo::PpoConfig;
 use gump_rl::sac::SacConfig;
-use gump_rl::{Autoreset, EnvConfig, PreparedScenario, TrafficSource};
+use gump_rl::{Algorithm, Autoreset, EnvConfig, PreparedScenario, TrafficSource};
 use serde::{Deserialize, Serialize};
 use toml::Table;
 
@@ -33,7 +35,8 @@ const STEP: f64 = 0.5;
 
 #[derive(Debug, clap::Subcommand)]
 pub(crate) enum Verb {
-    /// Train a driving policy, by soft actor-critic in a world or by imitation of the log.
+    /// Train a driving policy, by soft actor-critic or proximal policy optimization in a world or by
+    /// imitation of the log.
     Train(train::Args),
     /// Evaluate policies in closed loop and print the paper's columns.
     Evaluate(evaluate::Args),
@@ -49,8 +52,10 @@ pub(crate) enum Verb {
 struct Settings {
     /// Environment: episodes, observations and rewards.
     env: EnvConfig,
-    /// Hyperparameters of soft actor-critic.
+    /// Hyperparameters of soft actor-critic, and of imitation alone.
     sac: SacConfig,
+    /// Hyperparameters of proximal policy optimization.
+    ppo: PpoConfig,
 }
 
 impl Settings {
@@ -70,12 +75,24 @@ impl Settings {
         let settings: Self =
             toml::from_str(&tables.to_string()).map_err(|error| wrong(&error.message()))?;
         settings.sac.check().map_err(|error| wrong(&error))?;
+        settings.ppo.check().map_err(|error| wrong(&error))?;
         let fits = settings.sac.check_form(settings.env.observation.form());
         fits.map_err(|error| wrong(&format!("sac.encoder: {error}")))?;
         if settings.env.autoreset != Autoreset::SameStep {
             return Err(wrong(&"env.autoreset: learners expect \"same-step\"").into());
         }
         Ok(settings)
+    }
+}
+
+impl Settings {
+    /// Sets the steps of runs of an algorithm, if any are given.
+    fn set_steps(&mut self, algorithm: Algorithm, steps: Option<usize>) {
+        let own = match algorithm {
+            Algorithm::Ppo => &mut self.ppo.rounds,
+            _ => &mut self.sac.steps,
+        };
+        *own = steps.unwrap_or(*own);
     }
 }
 
@@ -91,6 +108,8 @@ fn known_keys() -> anyhow::Result<Table> {
     };
     let mut known = Table::new();
     known.insert("sac".into(), Table::try_from(sac)?.into());
+    let ppo = PpoConfig::default();
+    known.insert("ppo".into(), Table::try_from(ppo)?.into());
     known.insert("env".into(), true.into());
     Ok(known)
 }
@@ -216,9 +235,12 @@ mod tests {
 
     #[test]
     fn the_shipped_configurations_are_understood() {
+        let path = repository().join("configs/rl-ppo.toml");
+        let settings = Settings::read(Some(&path)).unwrap();
+        assert_ne!(settings.ppo, PpoConfig::default());
         for name in ["rl-tiny", "rl-raster"] {
             let path = repository().join(format!("configs/{name}.toml"));
-            let Settings { env, sac } = Settings::read(Some(&path)).unwrap();
+            let Settings { env, sac, .. } = Settings::read(Some(&path)).unwrap();
             assert_ne!(sac, SacConfig::default());
             assert_eq!(sac.encoder.is_some(), env.observation.packed_len() > 0);
         }

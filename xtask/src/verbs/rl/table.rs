@@ -8,7 +8,7 @@ use gump_eval::benchmarks::ScenarioSetName;
 use gump_eval::datasets::Split;
 use gump_eval::shard::Shard;
 use gump_eval::worlds::WorldName;
-use gump_rl::sac::Algorithm;
+use gump_rl::Algorithm;
 use gump_scene::Seed;
 use serde::{Deserialize, Serialize};
 
@@ -16,6 +16,7 @@ use super::columns::DivergedPolicy;
 use super::evaluate::{Candidate, Test, load};
 use super::train::{Diverged, Job, Place};
 use super::{PreparedSet, Settings, read, write};
+use crate::choices::{ALGORITHMS, one_of};
 use crate::cli::WrongArguments;
 use crate::run::{Common, Run};
 use crate::sampling::Sampling;
@@ -40,7 +41,10 @@ pub(crate) struct Args {
     /// Maximum number of test scenarios in learned worlds, which are slow [default: all]
     #[arg(long, value_name = "N")]
     model_limit: Option<NonZeroUsize>,
-    /// Gradient steps of each policy [default: the configuration's]
+    /// Learning algorithm of the policies that learn from rewards: sac or ppo
+    #[arg(long, value_parser = one_of(ALGORITHMS), default_value_t = Algorithm::Sac)]
+    algorithm: Algorithm,
+    /// Gradient steps of each policy, of PPO rounds [default: the configuration's]
     #[arg(long, value_name = "N")]
     steps: Option<usize>,
     /// Policies of each kind, which differ in their seeds
@@ -92,9 +96,12 @@ impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         self.check()?;
         let mut settings = Settings::read(self.common.config.as_deref())?;
-        settings.sac.steps = self.steps.unwrap_or(settings.sac.steps);
+        settings.set_steps(self.algorithm, self.steps);
         run.setting("env", settings.env)?;
         run.setting("sac", &settings.sac)?;
+        if self.algorithm == Algorithm::Ppo {
+            run.setting("ppo", &settings.ppo)?;
+        }
         let kinds = self.kinds();
         let jobs = self.jobs(run, &kinds, &settings);
         if self.train_only || self.shard == Shard::WHOLE {
@@ -140,6 +147,11 @@ impl Args {
                     .into(),
             );
         }
+        if self.algorithm == Algorithm::Imitation {
+            return wrong(
+                "--algorithm: imitation is in the table anyway, expected sac or ppo".into(),
+            );
+        }
         if self.world.contains(&WorldName::Log) {
             return wrong("--world: the log is trained in anyway, expected another world".into());
         }
@@ -171,14 +183,19 @@ impl Args {
                 "imitation",
                 imitating,
             ),
-            kind(Algorithm::Sac, &WorldName::Log, "sac-log", self.policies),
+            kind(
+                self.algorithm,
+                &WorldName::Log,
+                &format!("{}-log", self.algorithm),
+                self.policies,
+            ),
         ];
         for (i, world) in self.world.iter().enumerate() {
             let name = match i {
-                0 => "sac-world".to_owned(),
-                _ => format!("sac-world{}", i + 1),
+                0 => format!("{}-world", self.algorithm),
+                _ => format!("{}-world{}", self.algorithm, i + 1),
             };
-            kinds.push(kind(Algorithm::Sac, world, &name, self.policies));
+            kinds.push(kind(self.algorithm, world, &name, self.policies));
         }
         kinds
     }
@@ -203,6 +220,7 @@ impl Args {
                     resume: folder.join("checkpoint.safetensors").exists(),
                     folder,
                     stop_at: usize::MAX,
+                    from: None,
                 };
                 jobs.push((kind.name.as_str(), job));
             }

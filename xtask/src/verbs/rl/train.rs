@@ -1,6 +1,5 @@
 //! `rl train`: a policy, from rewards in a world or from the log alone.
 
-use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -9,12 +8,12 @@ use anyhow::Context as _;
 use gump_eval::benchmarks::ScenarioSetName;
 use gump_eval::datasets::Split;
 use gump_eval::worlds::WorldName;
-use gump_rl::sac::{Algorithm, Training};
-use gump_rl::{DrivingEnv, PreparedScenario, RlError, demonstrations};
+use gump_rl::{Actor, Algorithm, DrivingEnv, PreparedScenario, RlError, demonstrations};
 use gump_scene::Seed;
 use serde::Serialize;
 
 use super::curves::Curves;
+use super::learner::Learner;
 use super::{Notes, PreparedSet, RlWorld, Settings, read, write};
 use crate::choices::{ALGORITHMS, one_of};
 use crate::cli::WrongArguments;
@@ -39,12 +38,15 @@ pub(crate) struct Args {
     /// split
     #[arg(long, value_name = "SCENARIOS")]
     scenarios: ScenarioSetName,
-    /// Gradient steps [default: the configuration's]
+    /// Gradient steps, of PPO rounds [default: the configuration's]
     #[arg(long, value_name = "N")]
     steps: Option<usize>,
-    /// Stop at the first checkpoint from this gradient step on; continue with --resume
+    /// Stop at the first checkpoint from this step on; continue with --resume
     #[arg(long, value_name = "N")]
     stop_at: Option<usize>,
+    /// Begin with the policy and the critic of this run of PPO, its checkpoint.safetensors
+    #[arg(long, value_name = "FILE", conflicts_with = "resume")]
+    from: Option<PathBuf>,
     /// Continue the run in --out with its original configuration
     #[arg(long)]
     resume: bool,
@@ -65,8 +67,10 @@ pub(super) struct Job<'a> {
     pub(super) folder: PathBuf,
     /// Whether to resume the run in the folder.
     pub(super) resume: bool,
-    /// Gradient steps after which to stop early.
+    /// Steps after which to stop early.
     pub(super) stop_at: usize,
+    /// The checkpoint of a run of PPO to begin with.
+    pub(super) from: Option<PathBuf>,
 }
 
 /// Where a policy learns.
@@ -89,7 +93,7 @@ pub(super) struct Trained {
     seed: u64,
     steps: usize,
     env_steps: u64,
-    /// Gradient steps per environment step; none without an environment.
+    /// Gradient steps, of PPO rounds, per environment step; none without an environment.
     updates_per_env_step: Option<f64>,
     /// Of this part of the run, everything included.
     steps_per_second: f64,
@@ -106,7 +110,11 @@ pub(super) struct Trained {
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let mut settings = Settings::read(self.common.config.as_deref())?;
-        settings.sac.steps = self.steps.unwrap_or(settings.sac.steps);
+        settings.set_steps(self.algorithm, self.steps);
+        if self.from.is_some() && self.algorithm != Algorithm::Ppo {
+            let wrong = format!("--from: expected --algorithm ppo, found {}", self.algorithm);
+            return Err(WrongArguments(wrong).into());
+        }
         if self.algorithm == Algorithm::Imitation && self.train_world != WorldName::Log {
             let wrong = "--train-world: imitation learns from the log, expected log";
             return Err(WrongArguments(wrong.into()).into());
@@ -118,7 +126,10 @@ impl Args {
             RlWorld::load(&device, &self.train_world, &sampling)
         })?;
         run.setting("env", settings.env)?;
-        run.setting("sac", &settings.sac)?;
+        match self.algorithm {
+            Algorithm::Ppo => run.setting("ppo", &settings.ppo)?,
+            _ => run.setting("sac", &settings.sac)?,
+        }
         let job = Job {
             algorithm: self.algorithm,
             world_name: &self.train_world,
@@ -127,6 +138,7 @@ impl Args {
             folder: run.out().to_owned(),
             resume: self.resume,
             stop_at: self.stop_at.unwrap_or(usize::MAX),
+            from: self.from.clone(),
         };
         run.result("set", &set.name)?;
         let place = Place {
@@ -162,7 +174,7 @@ impl Job<'_> {
         }
     }
 
-    /// Whether the run in the folder has made all of its gradient steps.
+    /// Whether the run in the folder has made all of its steps.
     ///
     /// Error: as [`Self::execute`].
     pub(super) fn is_done(&self) -> anyhow::Result<bool> {
@@ -179,10 +191,10 @@ impl Job<'_> {
             self.resumed(&self.checkpoint(), &notes)?
         } else {
             let experts = demonstrations(place.prepared, &self.settings.env)?;
-            let config = self.settings.sac.clone();
-            Training::new(self.algorithm, config, experts, self.seed)?
+            let from = self.from.as_deref();
+            Learner::new(self.algorithm, self.settings, experts, self.seed, from)?
         };
-        let window = (training.config().segment / POINTS_PER_SEGMENT).max(1);
+        let window = (training.segment_len() / POINTS_PER_SEGMENT).max(1);
         let mut curves = if self.resume {
             Curves::read(&self.folder.join("curves.csv"), window, training.steps())?
         } else {
@@ -214,31 +226,23 @@ impl Job<'_> {
     }
 
     /// The run in the folder, if it has the requested settings.
-    fn resumed(&self, checkpoint: &Path, notes: &Notes) -> anyhow::Result<Training> {
+    fn resumed(&self, checkpoint: &Path, notes: &Notes) -> anyhow::Result<Learner> {
         let bytes = read(checkpoint)?;
         let in_file = || checkpoint.display().to_string();
-        let (training, found) = Training::from_bytes(&bytes).with_context(in_file)?;
+        let (_, found) = Actor::from_bytes(&bytes).with_context(in_file)?;
         let found = Notes::from_map(&found).with_context(in_file)?;
-        let requested = &self.settings.sac;
         for (flag, requested, begun) in [
-            ("--algorithm", notes.algorithm.clone(), found.algorithm),
-            (
-                "--train-world",
-                notes.train_world.clone(),
-                found.train_world,
-            ),
-            (
-                "--steps",
-                requested.steps.to_string(),
-                training.config().steps.to_string(),
-            ),
+            ("--algorithm", &notes.algorithm, &found.algorithm),
+            ("--train-world", &notes.train_world, &found.train_world),
         ] {
             if requested != begun {
                 let wrong = format!("{flag} {requested}: the run to resume began with {begun}");
                 return Err(WrongArguments(wrong).into());
             }
         }
-        if found.env != notes.env || training.config() != requested {
+        let (training, _) = Learner::from_bytes(self.algorithm, &bytes).with_context(in_file)?;
+        training.check(self.settings)?;
+        if found.env != notes.env {
             let wrong = "--config: the run to resume began with another configuration";
             return Err(WrongArguments(wrong.into()).into());
         }
@@ -249,10 +253,10 @@ impl Job<'_> {
         &self,
         run: &Run,
         place: Place<'_>,
-        training: &mut Training,
+        training: &mut Learner,
         curves: &mut Curves,
     ) -> anyhow::Result<()> {
-        let total = training.config().steps;
+        let total = training.total();
         let label = format!("{} in {}", self.algorithm, self.world_name);
         let progress = run.progress(&label, total as u64, "steps");
         progress.advance(training.steps() as u64);
@@ -261,18 +265,10 @@ impl Job<'_> {
         let mut saved = Instant::now();
         let mut saved_step = self.resume.then(|| training.steps());
         while training.steps() < total.min(self.stop_at) {
-            let observe = |report| {
+            let learned = training.segment(&mut env, curves, || {
                 progress.advance(1);
-                curves.push(report);
-                match run::interrupted() {
-                    true => ControlFlow::Break(()),
-                    false => ControlFlow::Continue(()),
-                }
-            };
-            let learned = match self.algorithm {
-                Algorithm::Imitation => training.imitation_segment(observe),
-                _ => training.segment(&mut env, observe),
-            };
+                !run::interrupted()
+            });
             learned.map_err(|error| self.ended(error, saved_step))?;
             anyhow::ensure!(
                 !run::interrupted(),
@@ -293,7 +289,7 @@ impl Job<'_> {
     /// a number of the run is not finite.
     fn write(
         &self,
-        training: &Training,
+        training: &Learner,
         curves: &Curves,
         saved_step: Option<usize>,
     ) -> anyhow::Result<()> {
