@@ -39,6 +39,9 @@ pub struct SampleConfig {
     pub hide_size: f64,
     /// Probability that an agent is observed late or lost early.
     pub cut_tracks: f64,
+    /// Probability that an agent is shown at a frame without its past: a network that always sees it
+    /// learns to repeat it.
+    pub forget: f64,
 }
 
 impl Default for SampleConfig {
@@ -55,6 +58,7 @@ impl Default for SampleConfig {
             hide_lights: 0.05,
             hide_size: 0.02,
             cut_tracks: 0.1,
+            forget: 0.0,
         }
     }
 }
@@ -69,6 +73,7 @@ impl SampleConfig {
             hide_lights: 0.0,
             hide_size: 0.0,
             cut_tracks: 0.0,
+            forget: 0.0,
             ..Self::default()
         }
     }
@@ -93,6 +98,11 @@ impl Sample {
     /// Number of nodes.
     pub fn n_nodes(&self) -> usize {
         self.nodes.len() / NODE_NUMBERS
+    }
+
+    /// Number of edges.
+    pub fn n_edges(&self) -> usize {
+        self.edges.sources.len()
     }
 }
 
@@ -169,6 +179,16 @@ impl State {
         pushed(next.logged, self.off.then())
     }
 
+    /// An agent that the log does not have.
+    pub fn added(pose: Pose, velocity: DVec2) -> Self {
+        Self {
+            logged: pose,
+            shown: pose,
+            velocity,
+            off: Off::default(),
+        }
+    }
+
     /// The same, for an agent that was led away from the log.
     pub fn led_to(self, pose: Pose) -> Self {
         Self {
@@ -207,13 +227,14 @@ pub trait TrackDriver {
     /// Share of samples that it drives.
     fn share(&self) -> f64;
 
-    /// Moves the tracks of a sample, which lies around `centre`, to the driven poses.
+    /// Moves the tracks of a sample, which lies around `centre`, to the driven poses, and may add
+    /// tracks.
     fn drive(
         &self,
         place: (&MapGraph, DVec2),
         map: &VectorMap,
         lights: &[Lights],
-        tracks: &mut [Track],
+        tracks: &mut Vec<Track>,
         seed: Seed,
     );
 }
@@ -263,7 +284,8 @@ pub fn draw(
         let place = (&*scenario.map, centre);
         driver.drive(place, &map, &lights, &mut tracks, seed.fork(0));
     }
-    Some(assemble(&map, &tracks, &lights))
+    let forget = (config.forget, seed.fork(1));
+    Some(assemble(&map, &tracks, &lights, forget))
 }
 
 /// The sample of all frames of a scenario from `start` on, without hiding and displacement, of the
@@ -284,7 +306,7 @@ pub fn whole(
     let track = |id: &AgentId| track(&frames, *id, &plain, 0.0, &mut nothing);
     let tracks: Vec<Track> = ids.iter().map(track).collect();
     let lights = lights(scenario, start, stride, n_frames);
-    Some(assemble(map, &tracks, &lights))
+    Some(assemble(map, &tracks, &lights, (0.0, Seed(0))))
 }
 
 /// The agents of a sample, and its centre.
@@ -428,8 +450,16 @@ fn lights(scenario: &Scenario, start: usize, stride: usize, n_frames: usize) -> 
     lights
 }
 
-fn assemble(map: &VectorMap, tracks: &[Track], lights: &[Lights]) -> Sample {
+/// `forget` is the probability that an agent is shown at a frame without its past, and the seed of
+/// these choices.
+fn assemble(
+    map: &VectorMap,
+    tracks: &[Track],
+    lights: &[Lights],
+    (forget, seed): (f64, Seed),
+) -> Sample {
     let n_frames = lights.len();
+    let mut rng = seed.rng();
     // Nodes frame by frame: which agents, how they are shown, and the first node of each frame.
     let mut shown: Vec<Vec<Option<Shown>>> = Vec::with_capacity(n_frames);
     let mut node_of: Vec<Vec<Option<u32>>> = Vec::with_capacity(n_frames);
@@ -471,7 +501,11 @@ fn assemble(map: &VectorMap, tracks: &[Track], lights: &[Lights]) -> Sample {
                 graph.sources.push(source);
                 sample.edge_numbers.extend(row);
             };
-            for ago in 0..=PAST.min(t) {
+            let past = match forget > 0.0 && rng.random_bool(forget) {
+                true => 0,
+                false => PAST.min(t),
+            };
+            for ago in 0..=past {
                 let (Some(then), Some(node)) = (&shown[t - ago][a], node_of[t - ago][a]) else {
                     break;
                 };

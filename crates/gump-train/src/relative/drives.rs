@@ -26,10 +26,11 @@ use rand::Rng as _;
 use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
+use crate::relative::crowd::Crowd;
 
 /// Frames that are shown as logged before the network drives: one move, so that it has seen agents
 /// move.
-const WARM_UP: usize = 2;
+pub(super) const WARM_UP: usize = 2;
 /// Weight of a radian, in metres, in choosing the move nearest to the log: about half a car's
 /// length, by which its corners move then. Chosen by hand.
 const METRES_PER_RADIAN: f64 = 2.0;
@@ -38,6 +39,8 @@ const METRES_PER_RADIAN: f64 = 2.0;
 const EDGES_M: f64 = 150.0;
 /// Separates the choice of how a sample is driven from its draws.
 const RULED: u64 = 1 << 32;
+/// Separates agents that are added to a sample from its draws.
+const CROWD: u64 = 1 << 33;
 
 /// Settings of drives by the network in training.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -63,6 +66,8 @@ pub struct RelativeDrives {
     /// probability. Targets are smoothed, and without truncation draws would spread a little more
     /// with each update.
     pub top_p: f64,
+    /// Agents that are added to those samples.
+    pub crowd: Crowd,
 }
 
 impl Default for RelativeDrives {
@@ -78,6 +83,7 @@ impl Default for RelativeDrives {
             ruled: 0.0,
             redraws: 8,
             top_p: 0.95,
+            crowd: Crowd::default(),
         }
     }
 }
@@ -114,7 +120,7 @@ impl RelativeDrives {
         if !self.temperature.is_finite() || self.temperature <= 0.0 {
             return fail("closed_loop.temperature", "temperature must be above 0");
         }
-        Ok(())
+        self.crowd.validate()
     }
 }
 
@@ -148,10 +154,16 @@ impl TrackDriver for NetworkDriver {
         (streets, centre): (&MapGraph, DVec2),
         map: &VectorMap,
         lights: &[Lights],
-        tracks: &mut [Track],
+        tracks: &mut Vec<Track>,
         seed: Seed,
     ) {
         let ruled = seed.fork(RULED).rng().random_bool(self.config.ruled);
+        if ruled {
+            let n_frames = lights.len();
+            self.config
+                .crowd
+                .join(streets, centre, tracks, n_frames, seed.fork(CROWD));
+        }
         let lane_map = ruled.then(|| LaneMap::of_curbs(streets, centre, EDGES_M));
         let memory = self.engine.remember(map);
         let mut members: Vec<Option<ObservedAgent>> = tracks.iter().map(|_| None).collect();

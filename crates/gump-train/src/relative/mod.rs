@@ -1,11 +1,13 @@
 //! Training of the relative network: drives, rewards from realism, and the trainer.
 
+mod crowd;
 mod drives;
 mod rewards;
 #[cfg(test)]
 mod tests;
 mod train;
 
+pub use self::crowd::Crowd;
 pub use self::drives::RelativeDrives;
 pub use self::rewards::RelativeRewards;
 pub use self::train::{RelativeStep, RelativeTrainConfig, RelativeTrainer};

@@ -3,8 +3,8 @@
 use candle_core::Device;
 use gump_engine::relative::{RelativeSampling, RelativeWorld};
 use gump_model::checkpoint;
-use gump_model::relative::graph::NODE_NUMBERS;
-use gump_model::relative::sample::{SampleConfig, draw};
+use gump_model::relative::graph::{Body, NODE_NUMBERS};
+use gump_model::relative::sample::{SampleConfig, State, Track, draw};
 use gump_model::relative::{RelativeConfig, RelativeNetwork, grid, is_relative, load, sample};
 use gump_rollout::{SimulateConfig, Start, WorldModel as _, simulate};
 use gump_scene::{Scenario, Seed, fixture};
@@ -232,6 +232,121 @@ fn agents_that_go_their_own_ways_learn_what_they_did() {
     assert!(worst(&ruled) < 1e-4, "{:?}", differences(&ruled));
     assert_ne!(ruled.nodes, led_back.nodes);
     assert_eq!(drawn(1.0).nodes, ruled.nodes);
+}
+
+/// A crowd joins samples under the rules, in which nobody stands inside another at first.
+#[test]
+fn a_crowd_stands_and_walks_in_the_way() {
+    let crowd = Crowd {
+        standing: 4,
+        people: 4,
+        vehicles: 4,
+    };
+    let whole = scenario();
+    let agents = |crowd: &Crowd, ruled, seed| {
+        let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
+        let config = RelativeDrives {
+            share: 1.0,
+            ruled,
+            crowd: crowd.clone(),
+            ..RelativeDrives::default()
+        };
+        let driver = drives::NetworkDriver::new(&network, &config).unwrap();
+        let sample = draw(&whole, &SampleConfig::plain(), Some(&driver), Seed(seed));
+        let targets = sample.unwrap().targets;
+        targets.iter().map(|target| target.agent).max().unwrap() + 1
+    };
+    let seeds = 0..12;
+    let most = seeds.clone().map(|seed| agents(&crowd, 1.0, seed)).max();
+    assert!(most > Some(8) && most <= Some(5 + 12), "{most:?}");
+    assert!(seeds.clone().all(|seed| agents(&crowd, 0.0, seed) == 5));
+    assert!(
+        seeds
+            .clone()
+            .all(|seed| agents(&Crowd::default(), 1.0, seed) == 5)
+    );
+    let joined = |seed| {
+        let mut tracks = tracks(&whole);
+        let (centre, n) = (whole.present().ego_now().state.pose.position, 18);
+        crowd.join(&whole.map, centre, &mut tracks, n, Seed(seed));
+        tracks
+    };
+    for seed in seeds {
+        let tracks = joined(seed);
+        assert_eq!(tracks.len(), joined(seed).len());
+        for (i, track) in tracks.iter().enumerate().skip(5) {
+            assert!(track.states.len() == 18 && track.states.iter().all(Option::is_some));
+            for t in 0..drives::WARM_UP {
+                let shape = |track: &Track| gump_geometry::OrientedBox {
+                    pose: track.states[t].unwrap().shown,
+                    length: track.body.length,
+                    width: track.body.width,
+                };
+                let own = shape(track);
+                assert!(!tracks[..i].iter().any(|other| own.overlaps(&shape(other))));
+            }
+        }
+    }
+    let too_many = RelativeDrives {
+        crowd: Crowd {
+            people: 65,
+            ..Crowd::default()
+        },
+        ..RelativeDrives::default()
+    };
+    let message = too_many.validate().unwrap_err().to_string();
+    assert!(message.contains("a crowd of 65"), "{message}");
+}
+
+/// The tracks of a scenario at 2 Hz.
+fn tracks(scenario: &Scenario) -> Vec<Track> {
+    let agents = scenario.log[0].agents();
+    let of = |first: &gump_scene::Agent| {
+        let frames = scenario.log.iter().step_by(5);
+        let states = frames.map(|frame| {
+            let state = frame.agent(first.id)?.state;
+            Some(State::added(state.pose, state.velocity))
+        });
+        Track {
+            body: Body {
+                kind: first.kind,
+                length: first.length,
+                width: first.width,
+                sized: true,
+            },
+            states: states.collect(),
+        }
+    };
+    agents.iter().map(of).collect()
+}
+
+/// An agent shown without its past has fewer edges and the same targets.
+#[test]
+fn the_past_is_forgotten_as_often_as_asked() {
+    let drawn = |forget| {
+        let config = SampleConfig {
+            forget,
+            ..SampleConfig::plain()
+        };
+        draw(&scenario(), &config, None, Seed(1)).unwrap()
+    };
+    let bins = |sample: &sample::Sample| -> Vec<_> {
+        let targets = sample.targets.iter();
+        targets.map(|target| (target.node, target.bins)).collect()
+    };
+    let n_edges = |sample: &sample::Sample| sample.n_edges() as i64;
+    let (all, some, none) = (drawn(0.0), drawn(0.5), drawn(1.0));
+    assert!(bins(&all) == bins(&some) && bins(&all) == bins(&none));
+    assert_eq!(all.nodes, none.nodes);
+    // Half as many are left out, but for chance.
+    let (half, whole) = (
+        n_edges(&all) - n_edges(&some),
+        n_edges(&all) - n_edges(&none),
+    );
+    assert!(
+        whole > 0 && (half - whole / 2).abs() < whole / 5,
+        "{half} of {whole}"
+    );
 }
 
 #[test]

@@ -16,8 +16,8 @@ use crate::cli::WrongArguments;
 
 /// A run that learns until all of its steps are done: gradient steps, of PPO rounds.
 pub(super) enum Learner {
-    Sac(Training),
-    Ppo(PpoTraining),
+    Sac(Box<Training>),
+    Ppo(Box<PpoTraining>),
 }
 
 impl Learner {
@@ -33,16 +33,18 @@ impl Learner {
     ) -> anyhow::Result<Self> {
         if algorithm != Algorithm::Ppo {
             let config = settings.sac.clone();
-            return Ok(Self::Sac(Training::new(algorithm, config, experts, seed)?));
+            let run = Training::new(algorithm, config, experts, seed)?;
+            return Ok(Self::Sac(Box::new(run)));
         }
         let config = settings.ppo.clone();
         let Some(path) = from else {
-            return Ok(Self::Ppo(PpoTraining::new(config, experts, seed)?));
+            let run = PpoTraining::new(config, experts, seed)?;
+            return Ok(Self::Ppo(Box::new(run)));
         };
         let in_file = || path.display().to_string();
         let (other, _) = PpoTraining::from_bytes(&read(path)?).with_context(in_file)?;
         let run = PpoTraining::continuing(config, &other, experts, seed).with_context(in_file)?;
-        Ok(Self::Ppo(run))
+        Ok(Self::Ppo(Box::new(run)))
     }
 
     /// A stored run, and its notes.
@@ -54,9 +56,9 @@ impl Learner {
     ) -> Result<(Self, BTreeMap<String, String>), RlError> {
         match algorithm {
             Algorithm::Ppo => {
-                PpoTraining::from_bytes(bytes).map(|(run, notes)| (Self::Ppo(run), notes))
+                PpoTraining::from_bytes(bytes).map(|(run, notes)| (Self::Ppo(Box::new(run)), notes))
             }
-            _ => Training::from_bytes(bytes).map(|(run, notes)| (Self::Sac(run), notes)),
+            _ => Training::from_bytes(bytes).map(|(run, notes)| (Self::Sac(Box::new(run)), notes)),
         }
     }
 

@@ -235,9 +235,11 @@ mod tests {
 
     #[test]
     fn the_shipped_configurations_are_understood() {
-        let path = repository().join("configs/rl-ppo.toml");
-        let settings = Settings::read(Some(&path)).unwrap();
-        assert_ne!(settings.ppo, PpoConfig::default());
+        for name in ["rl-ppo", "rl-ppo-refine"] {
+            let path = repository().join(format!("configs/{name}.toml"));
+            let settings = Settings::read(Some(&path)).unwrap();
+            assert_ne!(settings.ppo, PpoConfig::default());
+        }
         for name in ["rl-tiny", "rl-raster"] {
             let path = repository().join(format!("configs/{name}.toml"));
             let Settings { env, sac, .. } = Settings::read(Some(&path)).unwrap();
