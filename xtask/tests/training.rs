@@ -284,6 +284,31 @@ fn the_recorded_stages_of_the_shipped_weights_can_be_run() {
     assert!(fs::metadata(small).unwrap().len() < 12_000_000);
 }
 
+#[test]
+fn the_recorded_stages_of_the_relative_network_can_be_run() {
+    let place = Workplace::new();
+    let here = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let shipped = here.join("datasets/weights/gump-relative.safetensors");
+    let shipped = relative::load(&shipped, &Device::Cpu).unwrap();
+    for (name, stages) in [("relative.toml", 4), ("relative-rewards.toml", 1)] {
+        let recorded = fs::read_to_string(here.join("configs").join(name)).unwrap();
+        let on_these = recorded
+            .lines()
+            .map(|line| match line.starts_with("data = [") {
+                true => "data = ['first', 'more']",
+                false => line,
+            });
+        let on_these: Vec<&str> = on_these.collect();
+        fs::write(place.path(name), on_these.join("\n")).unwrap();
+        place.results(&format!("{name} --steps 1"), &format!("out-{stages}"));
+        for stage in 1..=stages {
+            let weights = format!("out-{stages}/stage-{stage}/weights.safetensors");
+            let network = relative::load(&place.path(&weights), &Device::Cpu).unwrap();
+            assert_eq!(network.config(), shipped.config());
+        }
+    }
+}
+
 /// A very small network with relative attention, whose second stage drives.
 const RELATIVE: &str = "
     model = 'relative'

@@ -159,6 +159,8 @@ pub struct Track {
     pub body: Body,
     /// By frame, where it is present.
     pub states: Vec<Option<State>>,
+    /// Whether it is an obstacle: it keeps its states, and there is nothing to learn from it.
+    pub is_obstacle: bool,
 }
 
 /// An agent at a frame.
@@ -398,6 +400,7 @@ fn track(
             sized,
         }),
         states,
+        is_obstacle: false,
     }
 }
 
@@ -522,7 +525,8 @@ fn assemble(
                 push(n_nodes + at, row);
             }
             graph.offsets.push(graph.sources.len() as u32);
-            if let Some(target) = target(tracks, a, t, own) {
+            let learns = !tracks[a].is_obstacle;
+            if let Some(target) = target(tracks, a, t, own).filter(|_| learns) {
                 let node = node_of[t][a].expect("the agent is present");
                 sample.targets.push(Target { node, ..target });
             }

@@ -146,7 +146,9 @@ impl Newcomer {
         })
     }
 
-    /// Its later poses are placeholders, which the drive replaces.
+    /// Those that stand are obstacles: if they were driven, vehicles that were put into a lane would
+    /// start, and from that the network would learn that parked vehicles do. The later poses of
+    /// others are placeholders, which the drive replaces.
     fn track(&self, n_frames: usize) -> Track {
         let state = |t: usize| {
             let pose = self.poses[t.min(WARM_UP - 1)];
@@ -155,6 +157,7 @@ impl Newcomer {
         Track {
             body: self.body,
             states: (0..n_frames).map(state).collect(),
+            is_obstacle: self.speed == 0.0,
         }
     }
 }

@@ -198,9 +198,13 @@ impl TrackDriver for NetworkDriver {
                 .collect();
             let seed = seed.fork(t as u64);
             if let Some(lane_map) = &lane_map {
-                let moves = self.moves_by_the_rules(&agents, lane_map, &hidden, seed, &mut room);
+                let stay: Vec<bool> = here.iter().map(|&a| tracks[a].is_obstacle).collect();
+                let crowd = (&agents[..], &stay[..]);
+                let moves = self.moves_by_the_rules(crowd, lane_map, &hidden, seed, &mut room);
                 for ((&a, now), step) in here.iter().zip(&agents).zip(moves) {
-                    if let Some(next) = &mut tracks[a].states[t + 1] {
+                    let track = &mut tracks[a];
+                    if let Some(next) = track.states[t + 1].as_mut().filter(|_| !track.is_obstacle)
+                    {
                         *next = next.led_to(now.pose * step);
                     }
                 }
@@ -227,10 +231,11 @@ impl TrackDriver for NetworkDriver {
 }
 
 impl NetworkDriver {
-    /// A move of every agent in its own frame, redrawn where the rules forbid it.
+    /// A move of every agent in its own frame, redrawn where the rules forbid it; obstacles, which
+    /// are marked, stay.
     fn moves_by_the_rules(
         &self,
-        agents: &[Shown],
+        (agents, stay): (&[Shown], &[bool]),
         lane_map: &LaneMap,
         hidden: &[f32],
         seed: Seed,
@@ -250,7 +255,11 @@ impl NetworkDriver {
             let of_draw = seed.fork(attempt as u64);
             let streams: Vec<Seed> = who.iter().map(|&i| of_draw.fork(i as u64)).collect();
             let bins = self.engine.decide(&rows, &streams, draw, room);
-            bins.into_iter().map(dequantize).collect()
+            let drawn = who.iter().zip(bins).map(|(&i, bins)| match stay[i] {
+                true => Pose::IDENTITY,
+                false => dequantize(bins),
+            });
+            drawn.collect()
         };
         let all: Vec<usize> = (0..agents.len()).collect();
         let mut moves = drawn(&all, 0);

@@ -276,6 +276,8 @@ fn a_crowd_stands_and_walks_in_the_way() {
         assert_eq!(tracks.len(), joined(seed).len());
         for (i, track) in tracks.iter().enumerate().skip(5) {
             assert!(track.states.len() == 18 && track.states.iter().all(Option::is_some));
+            let [first, later] = [0, 1].map(|t| track.states[t].unwrap().shown);
+            assert_eq!(track.is_obstacle, first == later);
             for t in 0..drives::WARM_UP {
                 let shape = |track: &Track| gump_geometry::OrientedBox {
                     pose: track.states[t].unwrap().shown,
@@ -315,6 +317,7 @@ fn tracks(scenario: &Scenario) -> Vec<Track> {
                 sized: true,
             },
             states: states.collect(),
+            is_obstacle: false,
         }
     };
     agents.iter().map(of).collect()
