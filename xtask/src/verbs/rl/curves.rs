@@ -256,6 +256,7 @@ impl Curves {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use gump_rl::ppo::PpoUpdate;
     use gump_rl::sac::UpdateReport;
 
     fn report(step: usize, returns: &[f64]) -> StepReport {
@@ -296,7 +297,13 @@ mod tests {
         assert!(svg.contains("<svg"));
         let path = folder.path().join("curves.csv");
         let cut = Curves::read(&path, 2, 10).unwrap();
-        assert_eq!(cut.rows, curves.rows[..5]);
+        assert_eq!(cut.rows.len(), 5);
+        for (read, row) in cut.rows.iter().zip(&curves.rows) {
+            // What PPO alone has is empty.
+            let own = column("divergence");
+            assert_eq!(read[..own], row[..own]);
+            assert!(read[own..].iter().all(|x| x.is_nan()));
+        }
         std::fs::write(&path, "step\n1,2\n").unwrap();
         assert!(
             Curves::read(&path, 2, 10)
@@ -304,6 +311,29 @@ mod tests {
                 .to_string()
                 .contains("line 2")
         );
+    }
+
+    #[test]
+    fn a_round_is_a_point() {
+        let mut curves = Curves::new(5);
+        let of_round = |round: usize| PpoReport {
+            round,
+            env_steps: 64 * round as u64,
+            update: PpoUpdate {
+                divergence: 0.01,
+                ..PpoUpdate::default()
+            },
+            learning_rate: 1e-4,
+            episodes: vec![Episode::default(); round],
+        };
+        (1..=3).for_each(|round| curves.push_round(&of_round(round)));
+        let folder = tempfile::tempdir().unwrap();
+        curves.write(folder.path()).unwrap();
+        let read = Curves::read(&folder.path().join("curves.csv"), 5, 2).unwrap();
+        assert_eq!(read.rows.len(), 2);
+        let cell = |name| read.rows[1][column(name)];
+        assert_eq!((cell("env_steps"), cell("episodes")), (128.0, 2.0));
+        assert!(cell("divergence") == 0.01 && cell("alpha").is_nan());
     }
 
     #[test]
