@@ -290,7 +290,11 @@ fn the_recorded_stages_of_the_relative_network_can_be_run() {
     let here = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
     let shipped = here.join("datasets/weights/gump-relative.safetensors");
     let shipped = relative::load(&shipped, &Device::Cpu).unwrap();
-    for (name, stages) in [("relative.toml", 4), ("relative-rewards.toml", 1)] {
+    // Realism needs road edges, which the scenes here do not have.
+    for (name, stages, data) in [
+        ("relative.toml", 4, "data = ['first', 'more']"),
+        ("relative-rewards.toml", 1, "data = ['fresh:recorded-like']"),
+    ] {
         let recorded = fs::read_to_string(here.join("configs").join(name)).unwrap();
         let on_these = recorded
             .lines()
