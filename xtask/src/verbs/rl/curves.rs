@@ -107,18 +107,15 @@ impl Curves {
         let n = self.open.len() as f64;
         let of_updates =
             |value: fn(&StepReport) -> f64| self.open.iter().map(value).sum::<f64>() / n;
-        let episodes: Vec<&Episode> = self.open.iter().flat_map(|r| &r.episodes).collect();
-        // Not a number where no episode ended.
-        let of_episodes = |value: fn(&Episode) -> f64| {
-            episodes.iter().map(|e| value(e)).sum::<f64>() / episodes.len() as f64
-        };
+        let [n_episodes, total, steps, terminated] =
+            of_episodes(self.open.iter().flat_map(|r| &r.episodes));
         self.rows.push([
             last.step as f64,
             last.env_steps as f64,
-            episodes.len() as f64,
-            of_episodes(|e| e.total),
-            of_episodes(|e| e.steps as f64),
-            of_episodes(|e| f64::from(u8::from(e.terminated))),
+            n_episodes,
+            total,
+            steps,
+            terminated,
             of_updates(|r| r.update.critic_loss),
             of_updates(|r| r.update.actor_loss),
             of_updates(|r| r.update.imitation_loss),
@@ -136,17 +133,15 @@ impl Curves {
 
     /// Adds a round of PPO, which is a point of its own; it has no temperature and no value.
     pub(super) fn push_round(&mut self, report: &PpoReport) {
-        let (episodes, update) = (&report.episodes, &report.update);
-        let of_episodes = |value: fn(&Episode) -> f64| {
-            episodes.iter().map(value).sum::<f64>() / episodes.len() as f64
-        };
+        let update = &report.update;
+        let [n_episodes, total, steps, terminated] = of_episodes(report.episodes.iter());
         self.rows.push([
             report.round as f64,
             report.env_steps as f64,
-            episodes.len() as f64,
-            of_episodes(|e| e.total),
-            of_episodes(|e| e.steps as f64),
-            of_episodes(|e| f64::from(u8::from(e.terminated))),
+            n_episodes,
+            total,
+            steps,
+            terminated,
             update.critic_loss,
             f64::NAN,
             update.imitation_loss,
@@ -251,6 +246,21 @@ impl Curves {
         };
         Ok(chart.save(stem)?)
     }
+}
+
+/// The number of episodes, and their mean return, length and share that terminated; not a number
+/// where no episode ended.
+fn of_episodes<'a>(episodes: impl Iterator<Item = &'a Episode>) -> [f64; 4] {
+    let mut sums = [0.0; 4];
+    for episode in episodes {
+        let terminated = f64::from(u8::from(episode.terminated));
+        let values = [1.0, episode.total, episode.steps as f64, terminated];
+        for (sum, value) in sums.iter_mut().zip(values) {
+            *sum += value;
+        }
+    }
+    let [n, total, steps, terminated] = sums;
+    [n, total / n, steps / n, terminated / n]
 }
 
 #[cfg(test)]
