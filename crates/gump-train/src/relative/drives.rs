@@ -8,7 +8,8 @@
 //!
 //! In a share of drives the agents move freely instead, under the rules of
 //! `gump_engine::relative::rules`: draws that would overlap an agent or leave the road are redrawn.
-//! The resulting motion is the target, so that the network learns to follow the rules itself.
+//! The resulting motion is the target, so that the network learns to follow the rules itself. Its
+//! own draws do not say how often parked vehicles start, so these stay where the log has them.
 
 use gump_engine::relative::engine::{Draw, RelativeEngine, Workspace};
 use gump_engine::relative::rules::resolve;
@@ -21,7 +22,7 @@ use gump_model::relative::grid::dequantize;
 use gump_model::relative::map::VectorMap;
 use gump_model::relative::sample::{Track, TrackDriver};
 use gump_model::relative::{RelativeNetwork, RelativeWeights};
-use gump_scene::{MapGraph, Seed};
+use gump_scene::{AgentKind, MapGraph, Seed};
 use rand::Rng as _;
 use serde::{Deserialize, Serialize};
 
@@ -35,6 +36,10 @@ pub(super) const WARM_UP: usize = 2;
 /// length, by which its corners move then. Chosen by hand.
 const METRES_PER_RADIAN: f64 = 2.0;
 
+/// A vehicle is parked if its log stays within this of its first pose, metres, ...
+const PARKED_M: f64 = 0.5;
+/// ... off lanes: farther than this from their centre lines, metres. Both were chosen by hand.
+const OFF_LANE_M: f64 = 1.5;
 /// Radius around a sample in which road edges are considered, metres. Chosen by hand.
 const EDGES_M: f64 = 150.0;
 /// Separates the choice of how a sample is driven from its draws.
@@ -165,6 +170,8 @@ impl TrackDriver for NetworkDriver {
                 .join(streets, centre, tracks, n_frames, seed.fork(CROWD));
         }
         let lane_map = ruled.then(|| LaneMap::of_curbs(streets, centre, EDGES_M));
+        let stays = |track: &Track| track.is_obstacle || is_parked(track, streets);
+        let stays: Vec<bool> = tracks.iter().map(stays).collect();
         let memory = self.engine.remember(map);
         let mut members: Vec<Option<ObservedAgent>> = tracks.iter().map(|_| None).collect();
         let (mut room, mut hidden) = (Workspace::default(), Vec::new());
@@ -198,13 +205,11 @@ impl TrackDriver for NetworkDriver {
                 .collect();
             let seed = seed.fork(t as u64);
             if let Some(lane_map) = &lane_map {
-                let stay: Vec<bool> = here.iter().map(|&a| tracks[a].is_obstacle).collect();
+                let stay: Vec<bool> = here.iter().map(|&a| stays[a]).collect();
                 let crowd = (&agents[..], &stay[..]);
                 let moves = self.moves_by_the_rules(crowd, lane_map, &hidden, seed, &mut room);
                 for ((&a, now), step) in here.iter().zip(&agents).zip(moves) {
-                    let track = &mut tracks[a];
-                    if let Some(next) = track.states[t + 1].as_mut().filter(|_| !track.is_obstacle)
-                    {
+                    if let Some(next) = tracks[a].states[t + 1].as_mut().filter(|_| !stays[a]) {
                         *next = next.led_to(now.pose * step);
                     }
                 }
@@ -231,8 +236,7 @@ impl TrackDriver for NetworkDriver {
 }
 
 impl NetworkDriver {
-    /// A move of every agent in its own frame, redrawn where the rules forbid it; obstacles, which
-    /// are marked, stay.
+    /// A move of every agent in its own frame, redrawn where the rules forbid it; marked agents stay.
     fn moves_by_the_rules(
         &self,
         (agents, stay): (&[Shown], &[bool]),
@@ -283,6 +287,18 @@ impl NetworkDriver {
         });
         candidates.collect()
     }
+}
+
+/// Whether a vehicle stands beside the lanes throughout its log.
+fn is_parked(track: &Track, streets: &MapGraph) -> bool {
+    let mut logged = track.states.iter().flatten().map(|state| state.logged);
+    let Some(first) = logged.next() else {
+        return false;
+    };
+    let place = first.position;
+    track.body.kind == AgentKind::Vehicle
+        && logged.all(|pose| pose.position.distance(place) < PARKED_M)
+        && streets.lanes_near(place, OFF_LANE_M).next().is_none()
 }
 
 /// Distance between two poses, metres.

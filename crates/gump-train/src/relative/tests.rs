@@ -234,6 +234,37 @@ fn agents_that_go_their_own_ways_learn_what_they_did() {
     assert_eq!(drawn(1.0).nodes, ruled.nodes);
 }
 
+/// A random network moves whoever it may; parked vehicles stay, and that they do is learned.
+#[test]
+fn parked_vehicles_stay_where_the_log_has_them() {
+    let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
+    let config = RelativeDrives {
+        share: 1.0,
+        ruled: 1.0,
+        ..RelativeDrives::default()
+    };
+    let driver = drives::NetworkDriver::new(&network, &config).unwrap();
+    let text = "lane 1: 0,0 200,0
+ego vehicle 0: 10,0 velocity 8,0
+\
+                agent vehicle 1: 40,4
+agent vehicle 2: 80,0
+agent pedestrian 3: 60,9";
+    let scenario = fixture::scenario(text).unwrap();
+    let sample = draw(&scenario, &SampleConfig::plain(), Some(&driver), Seed(3)).unwrap();
+    let whole = sample.targets.iter().map(|target| target.agent).max();
+    assert_eq!(whole, Some(3));
+    let starts = |agent| {
+        let own = sample.targets.iter().filter(|t| t.agent == agent).skip(1);
+        let moves: Vec<_> = own.map(|t| t.bins[0] != grid::STANDS).collect();
+        assert!(!moves.is_empty());
+        moves.contains(&true)
+    };
+    // Agents are numbered by their distance to one of them.
+    let moving = (0..4).filter(|agent| starts(*agent)).count();
+    assert_eq!(moving, 3, "all but the one beside the lane");
+}
+
 /// A crowd joins samples under the rules, in which nobody stands inside another at first.
 #[test]
 fn a_crowd_stands_and_walks_in_the_way() {
