@@ -138,6 +138,8 @@ pub(crate) struct NetworkLane {
     /// Highest speed at each sample of the track that its bends and those ahead on it allow,
     /// metres per second.
     pub(crate) bend_speeds: Vec<f64>,
+    /// Arc lengths at which drivers slow down for a bump, metres.
+    pub(crate) bumps: Vec<f64>,
     /// Lanes of the same junction whose surface this one shares.
     pub(crate) overlaps: Vec<Overlap>,
 }

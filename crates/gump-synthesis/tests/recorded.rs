@@ -3,8 +3,8 @@
 use std::sync::OnceLock;
 
 use gump_metrics::statistics::{Statistic as M, Statistics};
-use gump_scene::{Agent, AgentKind, Scenario, Seed};
-use gump_synthesis::{Profile, Tracker, track};
+use gump_scene::{Agent, AgentKind, AreaKind, Scenario, Seed};
+use gump_synthesis::{Profile, RoadFamily, SynthesisConfig, Tracker, track};
 use rayon::prelude::*;
 
 const N: u64 = 50;
@@ -196,4 +196,78 @@ fn some_vehicles_leave_the_road_across_its_edge() {
     }
     let share = crossing as f64 / f64::from(moving);
     assert!((0.005..0.1).contains(&share), "{crossing} of {moving}");
+}
+
+#[test]
+fn vehicles_slow_down_for_bumps() {
+    let mut with_bumps = 0;
+    let (mut over, mut crossings) = (0.0, 0.0);
+    for scene in clean() {
+        let areas = scene.map.areas().iter();
+        let bumps: Vec<_> = areas
+            .filter(|area| area.kind == AreaKind::SpeedBump)
+            .collect();
+        with_bumps += usize::from(!bumps.is_empty());
+        for agent in scene.log[0].agents() {
+            let of_frames = scene.log.iter().filter_map(|frame| frame.agent(agent.id));
+            let states: Vec<_> = of_frames.map(|agent| agent.state).collect();
+            let fastest = states.iter().map(|s| s.speed()).fold(0.0, f64::max);
+            let on_bump = |position| bumps.iter().any(|bump| bump.polygon.contains(position));
+            let slowest = states.iter().filter(|s| on_bump(s.pose.position));
+            let slowest = slowest.map(|s| s.speed()).fold(f64::INFINITY, f64::min);
+            if agent.kind == AgentKind::Vehicle && fastest > 5.0 && slowest > 0.5 && slowest < 1e3 {
+                over += slowest / fastest;
+                crossings += 1.0;
+            }
+        }
+    }
+    // Four of five recorded scenes have them.
+    assert!((30..=48).contains(&with_bumps), "{with_bumps} scenes");
+    let ratio = over / crossings;
+    assert!(crossings > 20.0 && (0.4..0.85).contains(&ratio), "{ratio}");
+}
+
+#[test]
+fn half_of_the_drivers_roll_over_stop_lines() {
+    let config = SynthesisConfig {
+        family: Some(RoadFamily::StopCrossing),
+        ..PROFILE.config()
+    };
+    let scene = |k| PROFILE.synthesize_clean(&config, Seed(78).fork(k));
+    let scenes: Vec<Scenario> = (0..40).into_par_iter().map(scene).collect();
+    let (mut passes, mut stops) = (0, 0);
+    for scene in &scenes {
+        let lanes = scene.map.stop_signs().iter().flat_map(|sign| &sign.lanes);
+        let lines = lanes.filter_map(|lane| scene.map.lane(*lane));
+        let lines: Vec<_> = lines.map(|lane| lane.centerline.pose_at(0.0)).collect();
+        for agent in scene.log[0].agents() {
+            let of_frames = scene.log.iter().filter_map(|frame| frame.agent(agent.id));
+            let states: Vec<_> = of_frames.map(|agent| agent.state).collect();
+            // Metres of the centre from the line, where the vehicle drives towards it.
+            let before = |state: &gump_scene::AgentState| {
+                let ahead = |line: &gump_geometry::Pose| {
+                    let local = line.inverse() * state.pose.position;
+                    let turn = gump_geometry::angle_difference(state.pose.heading, line.heading);
+                    let near = local.y.abs() < 2.0 && turn.abs() < 0.8;
+                    (near && local.x > -12.0 && local.x < 4.0).then_some(local.x)
+                };
+                lines.iter().find_map(ahead)
+            };
+            let near: Vec<_> = states
+                .iter()
+                .filter_map(|s| Some((before(s)?, s)))
+                .collect();
+            let comes = near.iter().any(|(x, _)| *x < -8.0);
+            let goes = near.iter().any(|(x, _)| *x > 3.0);
+            if agent.kind == AgentKind::Vehicle && comes && goes {
+                passes += 1;
+                stops += usize::from(near.iter().any(|(_, s)| s.speed() < 0.5));
+            }
+        }
+    }
+    let share = f64::from(stops as u32) / f64::from(passes);
+    assert!(
+        passes > 15 && (0.2..0.8).contains(&share),
+        "{stops} of {passes}"
+    );
 }

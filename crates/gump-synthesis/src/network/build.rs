@@ -179,6 +179,7 @@ impl Network {
         };
         let lane = NetworkLane {
             bend_speeds: bend_speeds(&track),
+            bumps: Vec::new(),
             track,
             width: if is_bike {
                 BIKE_LANE_WIDTH
@@ -280,6 +281,7 @@ fn road_lane(road: &RoadPlan, forward: bool, track: Track) -> NetworkLane {
     };
     NetworkLane {
         bend_speeds: bend_speeds(&track),
+        bumps: Vec::new(),
         track,
         width: road.lane_width,
         speed_limit: road.speed_limit,

@@ -18,6 +18,8 @@ use crate::plan::{Control, NodePlan, Plan, RoadPlan};
 const SHORTEST: f64 = 34.0;
 /// Metres between the sidewalks of a new road and those of the others.
 const CLEARANCE: f64 = 9.0;
+/// Roads of one lane each way with a limit below this may get all-way stops, m/s.
+const STREET: f64 = 13.0;
 /// Metres of a new road beside its own junction, where it is near the road it leaves.
 const OWN_JUNCTION: f64 = 26.0;
 /// Length of a driveway between the road and the first bay, metres: of one aisle alone, and of
@@ -91,10 +93,12 @@ fn add_side_road(plan: &mut Plan, at: (usize, f64, bool), extent: f64, rng: &mut
     let Some(reference) = [whole, 80.0].map(of_length).into_iter().find(clear) else {
         return false;
     };
-    let control = if rng.random_bool(0.9) {
-        Control::MinorStop
-    } else {
-        Control::MinorYield
+    let through = &plan.roads[at.0];
+    let is_street = through.forward == 1 && through.speed_limit < STREET;
+    let control = match rng.random_range(0.0..1.0) {
+        0.0..0.4 if is_street => Control::AllWayStop,
+        0.0..0.9 => Control::MinorStop,
+        _ => Control::MinorYield,
     };
     let corners = (rng.random_bool(0.15), rng.random_range(3.5..7.0));
     let node = split(plan, at, control, corners);

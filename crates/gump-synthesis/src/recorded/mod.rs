@@ -1,11 +1,12 @@
 //! Scenes with the statistics of recorded ones: the road families with additional features.
 //!
-//! `dress` adds side roads, car parks and parking to a plan; `scenery` adds parked vehicles,
+//! `dress` adds side roads, car parks and parking to a plan, `bumps` speed bumps; `scenery` adds parked vehicles,
 //! standing pedestrians and crossing ones anywhere on the network; `manoeuvres` and `walkers` add
 //! motion in car parks; this module combines them. Numbers and shares are fitted by hand to
 //! `configs/targets/waymo-like.toml` (docs/results/0017-recorded-like.md); distances that no target
 //! measures are chosen by eye.
 
+mod bumps;
 mod dress;
 mod driveways;
 mod manoeuvres;
@@ -31,15 +32,15 @@ use crate::{RoadFamily, SynthesisConfig};
 /// Weights of the families: recordings are made in towns, rarely on motorways. Fitted by hand in
 /// several rounds, towards roads as fast as recorded ones.
 const FAMILIES: [(RoadFamily, u32); 9] = [
-    (RoadFamily::SignalizedCrossing, 16),
-    (RoadFamily::StopCrossing, 8),
+    (RoadFamily::SignalizedCrossing, 12),
+    (RoadFamily::StopCrossing, 16),
     (RoadFamily::TeeJunction, 8),
     (RoadFamily::Roundabout, 2),
-    (RoadFamily::Arterial, 38),
+    (RoadFamily::Arterial, 36),
     (RoadFamily::CurvedRoad, 8),
     (RoadFamily::OnRamp, 18),
     (RoadFamily::MidBlockCrosswalk, 8),
-    (RoadFamily::Grid, 12),
+    (RoadFamily::Grid, 14),
 ];
 // Some formats state no limits, signs or lights (docs/decisions/0014-unknown-inputs.md). The shares
 // are chosen by hand, so that a network meets both.
@@ -98,6 +99,7 @@ pub(crate) fn draw_scenario(
     let n_lots = rng.random_range(1..=11);
     network.lay_lots(&plan, &trimmed, n_lots, 1..=6, &mut rng);
     let driveways = driveways::lay(&mut network, &plan, &trimmed, &mut rng);
+    bumps::lay(&mut network, &plan, &trimmed, &mut rng);
     let demand = draw_demand(config, &network, &driveways, &mut rng);
     let traffic_rng = seed.fork(attempt).fork(1).rng();
     let mut traffic = TrafficSimulation::new(&network, demand, config.dt, traffic_rng);

@@ -45,6 +45,16 @@ pub(crate) struct DriverParameters {
     pub(crate) late: f64,
     /// Speed below which a stop sign counts as obeyed, m/s.
     pub(crate) rolling_stop: f64,
+    /// Seconds between obeying a stop sign and going on.
+    pub(crate) pause: f64,
+    /// Speed over bumps, m/s.
+    pub(crate) bump_speed: f64,
+    /// Seconds to spare with which the driver passes before people who are still on their way to
+    /// the vehicle's path; without a number people always go first.
+    pub(crate) before_people: Option<f64>,
+    /// Seconds to spare with which the driver enters a junction behind those who are still on their
+    /// way out of the own path; without a number, when they are out of it.
+    pub(crate) behind_others: Option<f64>,
     /// Half the width within which the driver wanders in the lane, metres.
     pub(crate) wander: f64,
     /// Standard deviation of the random part of the acceleration, as a multiple of the usual one.
@@ -68,6 +78,10 @@ impl DriverParameters {
             yellow_braking: 3.0,
             late: 0.0,
             rolling_stop: 0.3,
+            pause: 0.6,
+            bump_speed: 5.0,
+            before_people: None,
+            behind_others: None,
             wander: 0.17,
             unrest: 1.0,
         }
@@ -94,22 +108,29 @@ impl DriverParameters {
             yellow_braking: around(3.2, -0.8, 0.6),
             late: 0.0,
             rolling_stop: 0.3,
+            pause: 0.0,
+            bump_speed: around(4.6, 1.0, 1.6),
+            before_people: Some(around(1.0, -0.6, 0.6).max(0.2)),
+            behind_others: Some(around(0.7, -0.3, 0.4).max(0.2)),
             wander: around(0.22, 0.0, 0.1),
             unrest: around(1.3, 0.4, 0.5).max(0.5),
             is_polite: true,
         };
+        // Half of the recorded drivers stay above 0.5 m/s at stop lines, and most of the others stand
+        // for less than two seconds.
+        let (rolling_stop, pause) = match rng.random_bool(0.6) {
+            true => (rng.random_range(0.6..2.4), rng.random_range(0.0..0.3)),
+            false => (0.3, rng.random_range(0.1..1.3)),
+        };
         Self {
-            is_polite: rng.random_bool((0.75 - 0.3 * hurry).clamp(0.0, 1.0)),
+            is_polite: rng.random_bool((0.35 - 0.3 * hurry).clamp(0.0, 1.0)),
             late: if rng.random_bool(0.06) {
                 rng.random_range(0.0..0.9)
             } else {
                 0.0
             },
-            rolling_stop: if rng.random_bool(0.35) {
-                rng.random_range(0.5..2.2)
-            } else {
-                0.3
-            },
+            rolling_stop,
+            pause,
             ..driver
         }
     }

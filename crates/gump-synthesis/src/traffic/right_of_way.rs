@@ -18,6 +18,10 @@ use crate::plan::Control;
 const CLEAR: f64 = 1.0;
 /// Metres of pavement beside a vehicle's way that must be free of people.
 const PERSON_CLEARANCE: f64 = 0.9;
+/// A faster vehicle in a junction is not about to stop, m/s.
+const SURE: f64 = 2.0;
+/// The speed that drivers expect of people, m/s.
+const FAST_WALK: f64 = 1.7;
 
 impl TrafficSimulation<'_> {
     /// Ends claims that are used up, then lets vehicles claim, those with priority first.
@@ -141,15 +145,15 @@ impl TrafficSimulation<'_> {
             LightState::Red | LightState::Unknown => false,
         };
         let stopped = match (connector.must_stop, vehicle.waiting_since) {
-            (true, Some(since)) => self.time - since > 0.6,
+            (true, Some(since)) => self.time - since > vehicle.driver.pause,
             (true, None) => false,
             (false, _) => true,
         };
         goes && stopped
             && self.is_first_in_line(vehicle, leg)
-            && self.is_unclaimed(i, lane, connector)
+            && self.is_unclaimed(i, lane, connector, distance)
             && self.has_priority(i, lane, connector, distance)
-            && self.is_free_of_people(vehicle, connector)
+            && self.is_free_of_people(vehicle, connector, distance)
             && self.has_room_beyond(i, leg)
             && self.has_room_in_ring(i, leg)
     }
@@ -194,7 +198,8 @@ impl TrafficSimulation<'_> {
     }
 
     /// True if no claim conflicts with this connector.
-    fn is_unclaimed(&self, i: usize, lane: LaneIdx, connector: &Connector) -> bool {
+    fn is_unclaimed(&self, i: usize, lane: LaneIdx, connector: &Connector, distance: f64) -> bool {
+        let vehicle = &self.vehicles[i];
         let clear = |(j, other): (usize, &Vehicle)| {
             j == i
                 || other.claims.iter().all(|&claimed| {
@@ -202,8 +207,17 @@ impl TrafficSimulation<'_> {
                     let Some(conflict) = conflict.filter(|_| claimed != lane) else {
                         return true;
                     };
-                    let rear = other.rear_on(self.network, claimed);
-                    rear.is_none_or(|rear| rear > conflict.theirs.1)
+                    let Some(rear) = other.rear_on(self.network, claimed) else {
+                        return true;
+                    };
+                    let left = conflict.theirs.1 - rear;
+                    let leaves = |spare: f64| {
+                        let out = left / other.speed;
+                        let sure = other.speed > SURE && other.acceleration > -0.5;
+                        let way = distance + conflict.mine.0;
+                        sure && out + spare < vehicle.soonest(way)
+                    };
+                    left < 0.0 || vehicle.driver.behind_others.is_some_and(leaves)
                 })
         };
         self.vehicles.iter().enumerate().all(clear)
@@ -247,9 +261,14 @@ impl TrafficSimulation<'_> {
     }
 
     /// True if no pedestrian is on the crosswalks on the path, or waits there and is given way.
-    fn is_free_of_people(&self, vehicle: &Vehicle, connector: &Connector) -> bool {
+    fn is_free_of_people(&self, vehicle: &Vehicle, connector: &Connector, distance: f64) -> bool {
         connector.crossings.iter().all(|crossing| {
             let signalled = connector.signal.is_some();
+            // Metres that people have to be away for the vehicle to pass before them.
+            let passes = distance + crossing.along.1 + vehicle.length();
+            let passed = passes / (0.5 * vehicle.speed + 4.0);
+            let spare = vehicle.driver.before_people;
+            let before = spare.map_or(f64::INFINITY, |spare| FAST_WALK * (passed + spare));
             self.people
                 .iter()
                 .all(|person| match person.on_crosswalk(self.network) {
@@ -258,9 +277,9 @@ impl TrafficSimulation<'_> {
                             Activity::Crosses { forward } => {
                                 let (low, high) = crossing.across;
                                 if forward {
-                                    place > high + PERSON_CLEARANCE
+                                    place > high + PERSON_CLEARANCE || place < low - before
                                 } else {
-                                    place < low - PERSON_CLEARANCE
+                                    place < low - PERSON_CLEARANCE || place > high + before
                                 }
                             }
                             Activity::Waits { may_go } => {

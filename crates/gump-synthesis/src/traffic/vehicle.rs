@@ -166,7 +166,8 @@ impl Vehicle {
         };
         let mut allowed = (lane.speed_limit * self.driver.speed_factor)
             .min(self.driver.top_speed)
-            .min(bend(self.lane(), self.s));
+            .min(bend(self.lane(), self.s))
+            .min(self.slowed_by_bumps(&lane.bumps, -self.s));
         let mut ahead = lane.length() - self.s;
         for &next in &self.path[(self.leg + 1).min(self.path.len())..] {
             if ahead > 80.0 {
@@ -174,10 +175,31 @@ impl Vehicle {
             }
             let limit = network.lanes[next].speed_limit * self.driver.speed_factor;
             let entry = bend(next, 0.0).min(limit);
-            allowed = allowed.min((entry * entry + 2.0 * 1.2 * ahead).sqrt());
+            allowed = allowed
+                .min((entry * entry + 2.0 * 1.2 * ahead).sqrt())
+                .min(self.slowed_by_bumps(&network.lanes[next].bumps, ahead));
             ahead += network.lanes[next].length();
         }
         allowed
+    }
+
+    /// The speed that bumps of a lane allow which starts `ahead` metres from the centre.
+    fn slowed_by_bumps(&self, bumps: &[f64], ahead: f64) -> f64 {
+        let of_bump = |bump: &f64| {
+            // Drivers speed up when the rear is over it.
+            let left = ahead + bump - self.length() / 2.0;
+            let over = left + self.length() < 0.0;
+            let speed = self.driver.bump_speed;
+            let allowed = (speed * speed + 2.0 * 1.2 * left.max(0.0)).sqrt();
+            if over { f64::INFINITY } else { allowed }
+        };
+        bumps.iter().map(of_bump).fold(f64::INFINITY, f64::min)
+    }
+
+    /// Seconds in which it can be `way` metres on, accelerating as is comfortable.
+    pub(crate) fn soonest(&self, way: f64) -> f64 {
+        let (v, a) = (self.speed, self.driver.acceleration);
+        ((v * v + 2.0 * a * way.max(0.0)).sqrt() - v) / a
     }
 
     /// Small random acceleration, none near standstill, m/s².
