@@ -15,7 +15,7 @@ pub(crate) use signal::Cycle;
 
 use std::collections::BTreeSet;
 
-use gump_geometry::{DVec2, Pose};
+use gump_geometry::{DVec2, Pose, wrap_angle};
 use gump_scene::{AreaKind, LaneKind, RoadEdgeKind, RoadLineKind};
 
 use crate::curve::Track;
@@ -62,14 +62,25 @@ pub(crate) struct Mouth {
     pub(crate) corners: [usize; 2],
     /// The edge of the road as if there were no opening.
     pub(crate) curb: Vec<DVec2>,
-    /// The surface between the curb and the two corners.
-    pub(crate) apron: Vec<DVec2>,
+}
+
+impl Mouth {
+    /// The middle of the curb; +y points away from the road.
+    fn pose(&self) -> Pose {
+        let curb = Track::through(&self.curb);
+        let middle = curb.pose_at(curb.length() / 2.0);
+        Pose {
+            heading: wrap_angle(middle.heading + std::f64::consts::PI),
+            ..middle
+        }
+    }
 }
 
 impl Network {
-    /// Draws the edge of the road across all mouths, and a driveway behind it, and forgets the
-    /// edges inside: recorded maps have no more of most yards and car parks.
-    pub(crate) fn close_mouths(&mut self) {
+    /// Draws the edge of the road across all mouths, with a driveway like any other behind it, and
+    /// forgets the edges inside: recorded maps have no more of most yards and car parks.
+    /// `driveway` draws the surface for the pose of a curb.
+    pub(crate) fn close_mouths(&mut self, mut driveway: impl FnMut(Pose) -> Vec<DVec2>) {
         let mut gone = std::mem::take(&mut self.inner_edges);
         let mouths = std::mem::take(&mut self.mouths);
         gone.extend(mouths.iter().flat_map(|mouth| mouth.corners));
@@ -77,9 +88,10 @@ impl Network {
         let kept = edges.enumerate().filter(|(i, _)| !gone.contains(i));
         self.furniture.edges = kept.map(|(_, edge)| edge).collect();
         for mouth in mouths {
+            let surface = driveway(mouth.pose());
+            self.furniture.areas.push((AreaKind::Driveway, surface));
             let edge = (RoadEdgeKind::Boundary, mouth.curb);
             self.furniture.edges.push(edge);
-            self.furniture.areas.push((AreaKind::Driveway, mouth.apron));
         }
     }
 }

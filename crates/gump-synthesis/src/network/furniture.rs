@@ -137,15 +137,7 @@ impl Network {
             let curb = connect(from.left_curb(), to.right_curb(), curvatures, 14.0);
             let curb = Track::through(&curb).points().to_vec();
             let corners = [first_edge + before, first_edge + i];
-            let mut apron = curb.clone();
-            for corner in [corners[1], corners[0]] {
-                apron.extend(backwards(self.furniture.edges[corner].1.clone()));
-            }
-            self.mouths.push(Mouth {
-                corners,
-                curb,
-                apron,
-            });
+            self.mouths.push(Mouth { corners, curb });
         }
     }
 

@@ -10,10 +10,10 @@ use crate::plan::Plan;
 
 // Recorded scenes (gpudrive/train, 137 of them): 108 have bumps, the median of those four; half are
 // about a metre deep, some are raised tables. The other numbers are chosen by eye.
-/// Share of scenes with bumps.
-const SCENES: f64 = 0.8;
+/// Share of scenes whose slow roads may have bumps.
+const SCENES: f64 = 0.9;
 /// Share of the roads of such a scene that have them.
-const ROADS: f64 = 0.4;
+const ROADS: f64 = 0.5;
 /// Roads with a higher limit have none, m/s.
 const FASTEST: f64 = 15.0;
 /// Metres of road without bumps at its ends.

@@ -201,7 +201,7 @@ fn hide_car_parks(network: &mut Network, ego: &Track, rng: &mut Rng) {
         let lanes = network.lanes.iter().enumerate();
         network.unmapped = lanes.filter(|(_, l)| slow(l)).map(|(i, _)| i).collect();
         if rng.random_bool(CLOSED_MOUTHS) {
-            network.close_mouths();
+            network.close_mouths(|curb| driveways::surface(curb, driveways::width(rng), rng));
         }
     }
 }
