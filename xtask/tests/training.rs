@@ -303,7 +303,7 @@ fn the_recorded_stages_of_the_relative_network_can_be_run() {
     };
     on_these("relative.toml");
     place.results("relative.toml --steps 1", "out");
-    for stage in 1..=4 {
+    for stage in 1..=6 {
         let weights = place.path(&format!("out/stage-{stage}/weights.safetensors"));
         let network = relative::load(&weights, &Device::Cpu).unwrap();
         assert_eq!(network.config(), shipped.config());
