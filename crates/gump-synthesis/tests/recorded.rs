@@ -265,7 +265,7 @@ fn half_of_the_drivers_roll_over_stop_lines() {
             }
         }
     }
-    let share = f64::from(stops as u32) / f64::from(passes);
+    let share = stops as f64 / f64::from(passes);
     assert!(
         passes > 15 && (0.2..0.8).contains(&share),
         "{stops} of {passes}"

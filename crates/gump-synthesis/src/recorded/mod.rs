@@ -1,8 +1,8 @@
 //! Scenes with the statistics of recorded ones: the road families with additional features.
 //!
-//! `dress` adds side roads, car parks and parking to a plan, `bumps` speed bumps; `scenery` adds parked vehicles,
-//! standing pedestrians and crossing ones anywhere on the network; `manoeuvres` and `walkers` add
-//! motion in car parks; this module combines them. Numbers and shares are fitted by hand to
+//! `dress` adds side roads, car parks and parking to a plan, `bumps` and `driveways` what their
+//! names say; `scenery` adds parked vehicles, standing pedestrians and crossing ones anywhere on the
+//! network; `manoeuvres` and `walkers` add motion in car parks; this module combines them. Numbers and shares are fitted by hand to
 //! `configs/targets/waymo-like.toml` (docs/results/0017-recorded-like.md); distances that no target
 //! measures are chosen by eye.
 

@@ -244,16 +244,17 @@ fn parked_vehicles_stay_where_the_log_has_them() {
         ..RelativeDrives::default()
     };
     let driver = drives::NetworkDriver::new(&network, &config).unwrap();
-    let text = "lane 1: 0,0 200,0
-ego vehicle 0: 10,0 velocity 8,0
-\
-                agent vehicle 1: 40,4
-agent vehicle 2: 80,0
-agent pedestrian 3: 60,9";
-    let scenario = fixture::scenario(text).unwrap();
+    let scenario = fixture::scenario(
+        "lane 1: 0,0 200,0
+         ego vehicle 0: 10,0 velocity 8,0
+         agent vehicle 1: 40,4
+         agent vehicle 2: 80,0
+         agent pedestrian 3: 60,9",
+    )
+    .unwrap();
     let sample = draw(&scenario, &SampleConfig::plain(), Some(&driver), Seed(3)).unwrap();
-    let whole = sample.targets.iter().map(|target| target.agent).max();
-    assert_eq!(whole, Some(3));
+    let last = sample.targets.iter().map(|target| target.agent).max();
+    assert_eq!(last, Some(3));
     let starts = |agent| {
         let own = sample.targets.iter().filter(|t| t.agent == agent).skip(1);
         let moves: Vec<_> = own.map(|t| t.bins[0] != grid::STANDS).collect();
