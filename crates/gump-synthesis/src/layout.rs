@@ -346,6 +346,7 @@ pub(crate) fn street(n: usize, major: bool, rng: &mut Rng) -> RoadPlan {
         median,
         bike_lanes: rng.random_bool(0.25),
         parking: n <= 2 && rng.random_bool(0.55),
+        parks_in_lane: false,
         bays: false,
         sidewalks: rng.random_bool(0.9),
         speed_limit: rng.random_range(speed),

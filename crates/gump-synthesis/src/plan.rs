@@ -71,6 +71,8 @@ pub(crate) struct RoadPlan {
     pub(crate) bike_lanes: bool,
     /// Parking strips along the curbs.
     pub(crate) parking: bool,
+    /// The strips lie within the outermost lanes, which are as wide as that takes.
+    pub(crate) parks_in_lane: bool,
     /// Cars park at right angles to the road, as in car parks, instead of along it.
     pub(crate) bays: bool,
     /// Sidewalks beyond the curbs.
@@ -134,7 +136,7 @@ impl RoadPlan {
             } else {
                 0.0
             };
-            half += if self.parking {
+            half += if self.parking && !self.parks_in_lane {
                 self.parking_depth()
             } else {
                 0.0

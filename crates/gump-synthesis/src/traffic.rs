@@ -4,6 +4,7 @@
 //! decide who may enter a junction ([`right_of_way`]): a vehicle that has claimed a connector
 //! shares no part of it with another claim, so boxes do not overlap.
 
+mod beside;
 mod crosser;
 mod demand;
 mod driver;
@@ -22,6 +23,7 @@ use gump_geometry::{DVec2, Pose};
 use gump_scene::{AgentKind, LightState, Rng};
 
 use crate::network::{LaneIdx, Network};
+use beside::Narrow;
 use crosser::Crosser;
 use occupancy::Occupancy;
 use people::Person;
@@ -53,6 +55,8 @@ pub(crate) struct TrafficSimulation<'a> {
     time: f64,
     vehicles: Vec<Vehicle>,
     parked: Vec<Body>,
+    /// Where parked vehicles stand partly in the lane, by lane; only in scenes like recorded ones.
+    narrows: Vec<Vec<Narrow>>,
     people: Vec<Person>,
     occupancy: Occupancy,
     next_id: i64,
@@ -71,6 +75,7 @@ impl<'a> TrafficSimulation<'a> {
             time: 0.0,
             vehicles: Vec::new(),
             parked: Vec::new(),
+            narrows: Vec::new(),
             people: Vec::new(),
             occupancy: Occupancy::new(network.lanes.len()),
             next_id: 0,
@@ -87,6 +92,9 @@ impl<'a> TrafficSimulation<'a> {
         self.step_crossers();
         self.settle_claims();
         self.choose_lanes();
+        for i in 0..self.vehicles.len() {
+            self.vehicles[i].beside = self.beside(&self.vehicles[i]);
+        }
         let accelerations: Vec<f64> = (0..self.vehicles.len())
             .map(|i| self.acceleration(i))
             .collect();

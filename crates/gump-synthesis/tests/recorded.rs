@@ -3,7 +3,7 @@
 use std::sync::OnceLock;
 
 use gump_metrics::statistics::{Statistic as M, Statistics};
-use gump_scene::{Agent, AgentKind, AreaKind, Scenario, Seed};
+use gump_scene::{Agent, AgentKind, AreaKind, LaneKind, Scenario, Seed};
 use gump_synthesis::{Profile, RoadFamily, SynthesisConfig, Tracker, track};
 use rayon::prelude::*;
 
@@ -105,6 +105,53 @@ fn vehicles_park_beside_the_lanes_not_in_them() {
     );
 }
 
+/// Recorded scenes have 2.2 of them, and 0.7 passes in nine seconds.
+#[test]
+fn vehicles_pass_those_that_are_parked_partly_in_the_lane() {
+    let (mut narrow, mut passes, mut clearance) = (0, 0, 0.0);
+    for scene in clean() {
+        for parked in scene.log[0].agents().iter().filter(|a| is_parked(scene, a)) {
+            let place = parked.state.pose;
+            let lanes = scene.map.lanes().iter();
+            let lanes = lanes.filter(|lane| lane.kind == LaneKind::SurfaceStreet);
+            let mut ahead = lanes.filter_map(|lane| {
+                let foot = lane.centerline.project(place.position);
+                let there = lane.centerline.pose_at(foot.arc_length);
+                let local = there.inverse() * place;
+                let beside = local.position.x.abs() < 0.5 && local.heading.cos() > 0.9;
+                let gap = -local.position.y - parked.width / 2.0;
+                (beside && (0.2..1.5).contains(&gap)).then_some((there, gap))
+            });
+            let Some((lane, gap)) = ahead.next() else {
+                continue;
+            };
+            narrow += 1;
+            let moving = scene.log[0]
+                .agents()
+                .iter()
+                .filter(|a| !is_parked(scene, a));
+            for other in moving.filter(|a| a.kind == AgentKind::Vehicle) {
+                let places = scene.log.iter().filter_map(|frame| frame.agent(other.id));
+                let local = places.map(|a| lane.inverse() * a.state.pose);
+                let abeam = local.filter(|p| p.position.x.abs() < 1.0 && p.heading.cos() > 0.9);
+                let nearest = abeam.map(|p| p.position.y - other.width / 2.0 + gap);
+                let nearest = nearest.filter(|gap| *gap < 3.0).reduce(f64::min);
+                if let Some(nearest) = nearest.filter(|gap| *gap > -0.5) {
+                    (passes, clearance) = (passes + 1, clearance + nearest);
+                }
+            }
+        }
+    }
+    // The tracker sees a quarter of these.
+    assert!(
+        (200..1500).contains(&narrow),
+        "{narrow} are partly in a lane"
+    );
+    let mean = clearance / f64::from(passes);
+    assert!(passes >= 50, "{passes} passes, {mean} m");
+    assert!((0.6..1.6).contains(&mean), "{mean} m between the sides");
+}
+
 #[test]
 fn shares_are_those_of_recordings() {
     let mut statistics = Statistics::default();
@@ -199,7 +246,7 @@ fn some_vehicles_leave_the_road_across_its_edge() {
 }
 
 #[test]
-fn vehicles_slow_down_for_bumps() {
+fn some_vehicles_slow_down_for_bumps() {
     let mut with_bumps = 0;
     let (mut over, mut crossings) = (0.0, 0.0);
     for scene in clean() {
@@ -224,7 +271,7 @@ fn vehicles_slow_down_for_bumps() {
     // Four of five recorded scenes have them.
     assert!((30..=48).contains(&with_bumps), "{with_bumps} scenes");
     let ratio = over / crossings;
-    assert!(crossings > 20.0 && (0.4..0.85).contains(&ratio), "{ratio}");
+    assert!(crossings > 20.0 && (0.6..0.97).contains(&ratio), "{ratio}");
 }
 
 #[test]

@@ -77,7 +77,8 @@ impl Network {
                 paint(RoadLineKind::BrokenSingleWhite, sign * offset);
             }
             let outer = road.lanes_half_width(forward);
-            if n > 0 && (road.bike_lanes || road.parking || road.freeway) {
+            let strip = road.parking && !road.parks_in_lane;
+            if n > 0 && (road.bike_lanes || strip || road.freeway) {
                 paint(RoadLineKind::SolidSingleWhite, sign * outer);
             }
             if n > 0 && road.bike_lanes && road.parking {

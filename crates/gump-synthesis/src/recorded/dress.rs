@@ -29,6 +29,12 @@ const DRIVEWAY: [f64; 2] = [16.0, 11.0];
 const YARD: std::ops::Range<f64> = 11.0..24.0;
 /// Share of scenes with a car park of several aisles, as in front of shops.
 const WIDE_CAR_PARKS: f64 = 0.4;
+/// Share of the kinds of streets with parking on which vehicles park within the lanes, how wide these
+/// are then, metres, and the highest limit before drivers hurry, m/s. Recorded lanes beside parked
+/// vehicles lie 5 m apart (median), and they are passed at 3 to 9 m/s.
+const IN_LANE: f64 = 0.6;
+const WIDE_LANES: std::ops::Range<f64> = 4.6..6.3;
+const STREET_SPEED: f64 = 10.0;
 /// Aisles leave their road within this of a right angle, radians.
 const SLANT: f64 = 0.3;
 
@@ -296,21 +302,31 @@ fn is_clear(plan: &Plan, from: usize, reference: &Track, half_width: f64) -> boo
 /// Decides for every kind of road in the plan whether vehicles park along it, and how.
 fn allow_parking(plan: &mut Plan, rng: &mut Rng) {
     // Roads of one kind share the width of their lanes, which was drawn for the kind.
-    let mut decided: BTreeMap<u64, (bool, bool)> = BTreeMap::new();
+    let mut decided: BTreeMap<u64, (bool, bool, Option<f64>)> = BTreeMap::new();
     for road in &mut plan.roads {
         if road.freeway || road.ring || road.bays || road.speed_limit < 7.0 {
             continue;
         }
         let n = road.forward.max(road.backward);
-        let (parking, bays) = *decided.entry(road.lane_width.to_bits()).or_insert_with(|| {
-            let share = match n {
-                1 => 0.85,
-                2 => 0.6,
-                _ => 0.3,
-            };
-            let bays = n == 1 && !road.bike_lanes && rng.random_bool(0.08);
-            (rng.random_bool(share), bays)
-        });
+        let (parking, bays, wide) =
+            *decided.entry(road.lane_width.to_bits()).or_insert_with(|| {
+                let share = match n {
+                    1 => 0.85,
+                    2 => 0.6,
+                    _ => 0.3,
+                };
+                let bays = n == 1 && !road.bike_lanes && rng.random_bool(0.08);
+                let parking = rng.random_bool(share);
+                let in_lane = parking && n == 1 && !bays && !road.bike_lanes;
+                let wide = in_lane && rng.random_bool(IN_LANE);
+                let wide = wide.then(|| rng.random_range(WIDE_LANES));
+                (parking, bays, wide)
+            });
         (road.parking, road.bays) = (parking, parking && bays);
+        if let Some(width) = wide {
+            road.lane_width = width;
+            road.parks_in_lane = true;
+            road.speed_limit = road.speed_limit.min(STREET_SPEED);
+        }
     }
 }

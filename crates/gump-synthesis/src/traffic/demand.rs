@@ -64,6 +64,9 @@ pub(crate) struct Standing {
 /// about as many vehicles leave the road as in recordings
 /// (docs/results/0025-where-realism-is-lost.md).
 const INTO_YARDS: f64 = 0.5;
+/// Cyclists ride at most this far from the lane's centre, metres: in wide lanes vehicles park beside
+/// them. Lanes without parked vehicles are narrower.
+const BICYCLE_ASIDE: f64 = 1.35;
 /// From this limit on a lane of a scene like a recorded one is fully used, m/s. Fitted by hand:
 /// recorded traffic drives faster than a plain draw of lanes.
 const FAST_LANE: f64 = 16.0;
@@ -123,6 +126,7 @@ impl TrafficSimulation<'_> {
                 place: None,
             });
         }
+        self.narrows = super::beside::narrows(self.network, &self.parked);
         for (lane, s) in std::mem::take(&mut self.demand.scenery.held) {
             let size = draw_real_size(&mut self.rng);
             let size = [size[0].min(9.0), size[1], size[2]];
@@ -251,7 +255,7 @@ impl TrafficSimulation<'_> {
         }
         vehicle.speed = speed;
         if kind == AgentKind::Bicycle && !l.is_bike_lane() {
-            vehicle.settle(-(l.width / 2.0 - 0.55));
+            vehicle.settle(-(l.width / 2.0 - 0.55).min(BICYCLE_ASIDE));
         }
         if self.demand.scenery.is_real && kind == AgentKind::Vehicle {
             // Hardly anybody drives in the very middle of the lane.
@@ -259,6 +263,9 @@ impl TrafficSimulation<'_> {
             let part: f64 = self.rng.random_range(-1.0..1.0);
             vehicle.settle(part * room);
         }
+        vehicle.beside = self.beside(&vehicle);
+        vehicle.lateral += vehicle.beside.aside;
+        vehicle.speed = vehicle.speed.min(vehicle.beside.speed);
         self.next_id += 1;
         self.vehicles.push(vehicle);
     }

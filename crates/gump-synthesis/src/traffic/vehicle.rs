@@ -5,6 +5,7 @@ use gump_scene::{AgentKind, Rng};
 use rand::Rng as _;
 
 use super::Body;
+use super::beside::Beside;
 use super::driver::DriverParameters;
 use crate::curve::{smooth_step, smooth_step_slope};
 use crate::network::{LaneIdx, Network};
@@ -14,6 +15,8 @@ use crate::network::{LaneIdx, Network};
 const STEERING_TIME: f64 = 0.75;
 /// The same at low speed, metres.
 const STEERING_LENGTH: f64 = 5.0;
+/// Share of the usual wandering that is left beside parked vehicles.
+const BESIDE: f64 = 0.4;
 /// Steepest change of acceleration when accelerating or easing off, m/s³. Chosen by hand.
 const JERK: f64 = 5.0;
 /// Steepest change of acceleration when braking hard, m/s³: full braking within a quarter of a
@@ -59,6 +62,8 @@ pub(crate) struct Vehicle {
     pub(crate) keep: f64,
     /// Added to `keep` while passing a bicycle.
     pub(crate) evade: f64,
+    /// How it passes parked vehicles.
+    pub(crate) beside: Beside,
     noise: f64,
     /// Connectors it may use.
     pub(crate) claims: Vec<LaneIdx>,
@@ -97,6 +102,7 @@ impl Vehicle {
             wander_left: 0.0,
             keep: rng.random_range(-0.12..0.12),
             evade: 0.0,
+            beside: Beside::NOTHING,
             noise: 0.0,
             claims: Vec::new(),
             waiting_since: None,
@@ -166,6 +172,7 @@ impl Vehicle {
         };
         let mut allowed = (lane.speed_limit * self.driver.speed_factor)
             .min(self.driver.top_speed)
+            .min(self.beside.speed)
             .min(bend(self.lane(), self.s))
             .min(self.slowed_by_bumps(&lane.bumps, -self.s));
         let mut ahead = lane.length() - self.s;
@@ -244,7 +251,11 @@ impl Vehicle {
             self.wander_left = rng.random_range(0.8..2.5) * self.speed.max(5.0);
             self.wander = rng.random_range(-self.driver.wander..self.driver.wander);
         }
-        let target = self.keep + self.evade + self.wander;
+        let (aside, wander) = match self.beside.aside {
+            0.0 => (self.evade, self.wander),
+            aside => (self.evade.max(aside), BESIDE * self.wander),
+        };
+        let target = self.keep + aside + wander;
         let k = 1.0 / (STEERING_TIME * self.speed).max(STEERING_LENGTH);
         let pull = k * k * (target - self.lateral) - 2.0 * k * self.slope;
         self.slope += pull * driven;

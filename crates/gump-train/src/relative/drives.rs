@@ -9,7 +9,8 @@
 //! In a share of drives the agents move freely instead, under the rules of
 //! `gump_engine::relative::rules`: draws that would overlap an agent or leave the road are redrawn.
 //! The resulting motion is the target, so that the network learns to follow the rules itself. Its
-//! own draws do not say how often parked vehicles start, so these stay where the log has them.
+//! own draws do not say how often parked vehicles start, nor how often somebody starts at red, so
+//! these stay where the log has them.
 
 use gump_engine::relative::engine::{Draw, RelativeEngine, Workspace};
 use gump_engine::relative::rules::resolve;
@@ -20,9 +21,9 @@ use gump_model::local_context::LaneMap;
 use gump_model::relative::graph::{Lights, Shown};
 use gump_model::relative::grid::dequantize;
 use gump_model::relative::map::VectorMap;
-use gump_model::relative::sample::{Track, TrackDriver};
+use gump_model::relative::sample::{State, Track, TrackDriver};
 use gump_model::relative::{RelativeNetwork, RelativeWeights};
-use gump_scene::{AgentKind, MapGraph, Seed};
+use gump_scene::{AgentKind, LightState, MapGraph, Seed};
 use rand::Rng as _;
 use serde::{Deserialize, Serialize};
 
@@ -40,6 +41,13 @@ const METRES_PER_RADIAN: f64 = 2.0;
 const PARKED_M: f64 = 0.5;
 /// ... off lanes: farther than this from their centre lines, metres. Both were chosen by hand.
 const OFF_LANE_M: f64 = 1.5;
+/// A vehicle waits at red if it stands as its log does, within this, metres, while its log moves no
+/// farther in the next step, ...
+const WAITS_M: f64 = 0.2;
+/// ... and a lane at red starts ahead of it, this far at most, and this far aside, metres. All were
+/// chosen by hand.
+const RED_AHEAD_M: f64 = 60.0;
+const RED_ASIDE_M: f64 = 6.0;
 /// Radius around a sample in which road edges are considered, metres. Chosen by hand.
 const EDGES_M: f64 = 150.0;
 /// Separates the choice of how a sample is driven from its draws.
@@ -209,11 +217,18 @@ impl TrackDriver for NetworkDriver {
                 .collect();
             let seed = seed.fork(t as u64);
             if let Some(lane_map) = &lane_map {
-                let stay: Vec<bool> = here.iter().map(|&a| stays[a]).collect();
+                let red = red_lanes(lights, streets);
+                let waits = |track: &Track| {
+                    let both = track.states[t].zip(track.states[t + 1]);
+                    let is_vehicle = track.body.kind == AgentKind::Vehicle;
+                    is_vehicle && both.is_some_and(|(now, next)| waits(&now, &next, &red))
+                };
+                let stay = here.iter().map(|&a| stays[a] || waits(&tracks[a]));
+                let stay: Vec<bool> = stay.collect();
                 let crowd = (&agents[..], &stay[..]);
                 let moves = self.moves_by_the_rules(crowd, lane_map, &hidden, seed, &mut room);
-                for ((&a, now), step) in here.iter().zip(&agents).zip(moves) {
-                    if let Some(next) = tracks[a].states[t + 1].as_mut().filter(|_| !stays[a]) {
+                for (((&a, now), step), stays) in here.iter().zip(&agents).zip(moves).zip(stay) {
+                    if let Some(next) = tracks[a].states[t + 1].as_mut().filter(|_| !stays) {
                         *next = next.led_to(now.pose * step);
                     }
                 }
@@ -303,6 +318,30 @@ fn is_parked(track: &Track, streets: &MapGraph) -> bool {
     track.body.kind == AgentKind::Vehicle
         && logged.all(|pose| pose.position.distance(place) < PARKED_M)
         && streets.lanes_near(place, OFF_LANE_M).next().is_none()
+}
+
+/// Where lanes at red start.
+fn red_lanes(lights: &Lights, streets: &MapGraph) -> Vec<Pose> {
+    let red = lights
+        .by_lane
+        .iter()
+        .filter(|(_, state, _)| *state == LightState::Red);
+    let start = |id| Some(streets.lane(id)?.centerline.pose_at(0.0));
+    red.filter_map(|(id, _, _)| start(*id)).collect()
+}
+
+/// Whether an agent stands where its log does, and a light ahead is the reason.
+fn waits(now: &State, next: &State, red: &[Pose]) -> bool {
+    let apart = |a: Pose, b: Pose| a.position.distance(b.position);
+    let ahead = |line: &Pose| {
+        let local = now.shown.inverse() * *line;
+        (0.0..RED_AHEAD_M).contains(&local.position.x)
+            && local.position.y.abs() < RED_ASIDE_M
+            && local.heading.cos() > 0.7
+    };
+    apart(now.logged, next.logged) < WAITS_M
+        && apart(now.shown, now.logged) < WAITS_M
+        && red.iter().any(ahead)
 }
 
 /// Distance between two poses, metres.

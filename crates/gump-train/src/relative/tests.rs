@@ -266,6 +266,32 @@ fn parked_vehicles_stay_where_the_log_has_them() {
     assert_eq!(moving, 3, "all but the one beside the lane");
 }
 
+/// A random network does not wait at red; a vehicle whose log does is held there.
+#[test]
+fn vehicles_that_wait_at_red_do_not_learn_to_start() {
+    let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
+    let config = RelativeDrives {
+        share: 1.0,
+        ruled: 1.0,
+        ..RelativeDrives::default()
+    };
+    let driver = drives::NetworkDriver::new(&network, &config).unwrap();
+    let starts = |light: &str| {
+        let text = format!(
+            "lane 1: 0,0 40,0
+             lane 2: 40,0 200,0
+             light 2 {light}: 40,0
+             ego vehicle 0: 30,0"
+        );
+        let scenario = fixture::scenario(&text).unwrap();
+        let sample = draw(&scenario, &SampleConfig::plain(), Some(&driver), Seed(3)).unwrap();
+        let own = sample.targets.iter().skip(1);
+        own.filter(|t| t.bins[0] != grid::STANDS).count()
+    };
+    assert_eq!(starts("red"), 0);
+    assert!(starts("green") > 0);
+}
+
 /// A crowd joins samples under the rules, in which nobody stands inside another at first.
 #[test]
 fn a_crowd_stands_and_walks_in_the_way() {
