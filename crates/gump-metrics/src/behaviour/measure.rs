@@ -29,6 +29,8 @@ pub enum Measure {
     SetOff,
     /// An agent stands at a given time.
     Standing,
+    /// A vehicle that moves slowly in the present stands at a given time.
+    ComeToRest,
     /// Lights of crossing approaches are green at the same time.
     ConflictingGreen,
     /// A light changes its colour.
@@ -43,7 +45,7 @@ pub enum Measure {
 
 impl Measure {
     /// All, in the order of tables.
-    pub const ALL: [Self; 15] = [
+    pub const ALL: [Self; 16] = [
         Self::ParkedMove,
         Self::FreeRoadStop,
         Self::FreeRoadStanding,
@@ -54,6 +56,7 @@ impl Measure {
         Self::LaneChange,
         Self::SetOff,
         Self::Standing,
+        Self::ComeToRest,
         Self::ConflictingGreen,
         Self::LightChange,
         Self::LightRed,
@@ -74,6 +77,7 @@ impl Measure {
             Self::LaneChange => "lane_change",
             Self::SetOff => "set_off",
             Self::Standing => "standing",
+            Self::ComeToRest => "come_to_rest",
             Self::ConflictingGreen => "conflicting_green",
             Self::LightChange => "light_change",
             Self::LightRed => "light_red",
@@ -94,6 +98,7 @@ impl Measure {
             Self::FreeRoadStop | Self::LaneChange => "minute of moving",
             Self::FreeRoadStanding => "vehicle that moves",
             Self::NewOverlap | Self::Standing => "agent",
+            Self::ComeToRest => "vehicle that moves slowly",
             Self::HardAcceleration | Self::SetOff => "minute",
             Self::LightChange => "minute of a light",
             Self::LightRed => "time of a light",
@@ -114,6 +119,11 @@ impl Measure {
     /// share or a number per agent.
     pub fn is_duration(self) -> bool {
         matches!(self, Self::RedPhase | Self::GreenPhase)
+    }
+
+    /// True if the value is of moments instead of the whole horizon.
+    pub fn is_of_moments(self) -> bool {
+        matches!(self, Self::Standing | Self::ComeToRest)
     }
 
     /// True if the value depends on the horizon, so that a shorter log has none.
@@ -208,7 +218,7 @@ pub struct Key {
     pub measure: Measure,
     /// The class.
     pub class: Class,
-    /// For [`Measure::Standing`] the second after the present, otherwise the horizon.
+    /// Of a measure [of moments](Measure::is_of_moments) the second after the present, otherwise the horizon.
     pub seconds: u32,
 }
 

@@ -491,6 +491,32 @@ fn who_sets_off_and_who_stands() {
 }
 
 #[test]
+fn who_drives_slowly_and_comes_to_rest() {
+    let text = format!(
+        "{ROAD}history 1 future 8 dt 0.1
+         agent vehicle 1: 60,0
+         agent vehicle 2: 20,7 velocity 20,0
+         agent bicycle 3: 40,7 velocity 5,0"
+    );
+    let scenario = scenario(&text);
+    let rollout = only(&scenario, 0, |pose, t| ahead(pose, braking(10.0, t)));
+    let behaviour = Behaviour::new(&scenario, 8);
+    let (log, future) = (behaviour.log().tally, behaviour.of(&rollout).tally);
+    let at_rest = |tally: &Tally, seconds| {
+        let found = tally.count(Measure::ComeToRest, Class::Vehicle, seconds);
+        (found.events, found.of)
+    };
+    // The ego alone: one vehicle stands before, one is fast, and bicycles do not count.
+    assert_eq!(
+        [2, 8].map(|s| at_rest(&future, s)),
+        [(0.0, 1.0), (1.0, 1.0)]
+    );
+    assert_eq!([2, 8].map(|s| at_rest(&log, s)), [(0.0, 1.0), (0.0, 1.0)]);
+    let cyclist = future.count(Measure::ComeToRest, Class::Bicycle, 8);
+    assert_eq!(cyclist.rate(), None);
+}
+
+#[test]
 fn crossing_lights_must_not_be_green_at_once() {
     let check = |lights: &str, expected: Option<f64>| {
         let text = format!(

@@ -27,7 +27,7 @@ const CHARTS: [Chart; 4] = [
     (
         "shares",
         "share, or number per agent, with 95 % intervals over scenarios",
-        |measure| !measure.is_rate() && !measure.is_duration() && measure != Measure::Standing,
+        |measure| !measure.is_rate() && !measure.is_duration() && !measure.is_of_moments(),
     ),
     (
         "rates",
@@ -37,7 +37,7 @@ const CHARTS: [Chart; 4] = [
     (
         "standing",
         "share that stands, with 95 % intervals over scenarios",
-        |measure| measure == Measure::Standing,
+        Measure::is_of_moments,
     ),
     (
         "phases",
@@ -238,6 +238,7 @@ fn chart(label: &str, columns: &[&Column], keys: &[Key], shows: impl Fn(Measure)
         } = keys[i];
         match measure {
             Measure::Standing => format!("{class}, {seconds} s"),
+            Measure::ComeToRest => format!("{class}, slow, {seconds} s"),
             _ => format!("{}, {class}", measure.name().replace('_', " ")),
         }
     });
