@@ -11,6 +11,7 @@ mod lot;
 mod sidewalk;
 mod signal;
 
+pub(crate) use lot::SLANT;
 pub(crate) use signal::Cycle;
 
 use std::collections::BTreeSet;

@@ -1,4 +1,5 @@
-//! Parking lots beside the road: rows of places at right angles to it.
+//! Parking lots beside the road: rows of places at right angles to it, in scenes like recorded ones
+//! also at other angles.
 
 use std::ops::RangeInclusive;
 
@@ -14,6 +15,15 @@ use crate::plan::Plan;
 // not varied.
 /// From the curb to the near end of the places: sidewalk, strip of green, aisle; metres.
 const SET_BACK: f64 = 7.0;
+/// The same in scenes like recorded ones, where vehicles stand right behind the sidewalk or farther
+/// back.
+const REAL_SET_BACK: std::ops::Range<f64> = 3.5..9.0;
+/// Share of lots of such scenes that are turned against the road, and that have slanted places;
+/// radians. A third of the recorded vehicles that stand off lanes stand aslant to the nearest one.
+const TURNED: f64 = 0.45;
+const MOST_TURNED: f64 = 0.8;
+const SLANTED: f64 = 0.4;
+pub(crate) const SLANT: std::ops::Range<f64> = 0.3..0.8;
 /// Depth of a place, metres: vehicles that park are no longer.
 const DEPTH: f64 = 5.6;
 /// Width of the aisle between two pairs of rows, metres.
@@ -44,6 +54,19 @@ impl Network {
             let (r, track) = (&plan.roads[road], &trimmed[road]);
             let n_places = rng.random_range(5..14);
             let spacing = rng.random_range(2.7..3.1);
+            // A range of one value draws nothing more, which keeps the scenes of lots of one row.
+            let is_real = rows.start() != rows.end();
+            let mut draw = |share: f64, angles: std::ops::Range<f64>| {
+                let is_so = is_real && rng.random_bool(share);
+                is_so.then(|| rng.random_range(angles)).unwrap_or_default()
+            };
+            let turned = draw(TURNED, -MOST_TURNED..MOST_TURNED);
+            let slant = draw(SLANTED, SLANT) * if draw(0.5, 0.0..1.0) > 0.0 { 1.0 } else { -1.0 };
+            let spacing = spacing / f64::cos(slant);
+            let set_back = match is_real {
+                true => rng.random_range(REAL_SET_BACK),
+                false => SET_BACK,
+            };
             let half = spacing * f64::from(n_places) / 2.0;
             if lots.len() == n || r.freeway || r.ring || track.length() < 2.0 * half + 12.0 {
                 continue;
@@ -60,16 +83,16 @@ impl Network {
                     wrap_angle(along.heading + std::f64::consts::PI)
                 },
             };
-            let corner = |x: f64, y: f64| curb * DVec2::new(x, y);
-            // A range of one value draws nothing, which keeps the scenes of lots of one row.
-            let n_rows = if rows.start() == rows.end() {
-                *rows.start()
-            } else {
-                rng.random_range(rows.clone())
+            let n_rows = match is_real {
+                true => rng.random_range(rows.clone()),
+                false => *rows.start(),
             };
+            // Turned about the middle of its near side, as far back as its corner then needs.
+            let curb = curb * Pose::new(0.0, half * f64::sin(turned).abs(), turned);
+            let corner = |x: f64, y: f64| curb * DVec2::new(x, y);
             // The second row of a pair is reached from behind.
             let behind = if n_rows.is_multiple_of(2) { AISLE } else { 0.0 };
-            let far = row_start(n_rows - 1) + DEPTH + 0.5 + behind;
+            let far = row_start(set_back, n_rows - 1) + DEPTH + 0.5 + behind;
             let ring = vec![
                 corner(-half, 0.4),
                 corner(half, 0.4),
@@ -77,8 +100,8 @@ impl Network {
                 corner(-half, far),
             ];
             let places = [
-                corner(-half, SET_BACK - 1.5),
-                corner(half, SET_BACK - 1.5),
+                corner(-half, set_back - 1.5),
+                corner(half, set_back - 1.5),
                 ring[2],
                 ring[3],
             ];
@@ -96,9 +119,9 @@ impl Network {
             for (row, k) in (0..n_rows).flat_map(|row| (0..n_places).map(move |k| (row, k))) {
                 let x = (f64::from(k) + 0.5) * spacing - half;
                 let nose_in = if rng.random_bool(0.8) { 0.5 } else { -0.5 };
-                let heading = wrap_angle(curb.heading + nose_in * std::f64::consts::PI);
+                let heading = wrap_angle(curb.heading + nose_in * std::f64::consts::PI + slant);
                 self.lot_places.push(Pose {
-                    position: corner(x, row_start(row) + DEPTH / 2.0),
+                    position: corner(x, row_start(set_back, row) + DEPTH / 2.0),
                     heading,
                 });
             }
@@ -120,8 +143,8 @@ impl Network {
 
 /// Metres from the curb to the near end of a row: rows lie back to back in pairs, with an aisle
 /// between pairs.
-fn row_start(row: usize) -> f64 {
-    SET_BACK + row as f64 * DEPTH + (row / 2) as f64 * AISLE
+fn row_start(set_back: f64, row: usize) -> f64 {
+    set_back + row as f64 * DEPTH + (row / 2) as f64 * AISLE
 }
 
 /// True if the borders of two polygons come closer than the clearance, or one contains the other.

@@ -33,7 +33,7 @@ const WIDE_CAR_PARKS: f64 = 0.4;
 /// are then, metres, and the highest limit before drivers hurry, m/s. Recorded lanes beside parked
 /// vehicles lie 5 m apart (median), and they are passed at 3 to 9 m/s.
 const IN_LANE: f64 = 0.6;
-const WIDE_LANES: std::ops::Range<f64> = 4.6..6.3;
+const WIDE_LANES: std::ops::Range<f64> = 4.6..7.2;
 const STREET_SPEED: f64 = 10.0;
 /// Aisles leave their road within this of a right angle, radians.
 const SLANT: f64 = 0.3;

@@ -11,8 +11,11 @@ use crate::traffic::{Standing, draw_real_size};
 
 // Distances and shares, here and in the functions below, were chosen by eye and not varied one by
 // one (see the module above).
-/// From the curb to the end of a driveway, behind the sidewalk, metres.
-const DEPTH: f64 = 4.6;
+/// From the curb to the near end of a vehicle, metres: from the middle of the sidewalk on.
+const PLACE: std::ops::Range<f64> = 3.0..7.5;
+/// Share of vehicles that stand aslant, and by how much at most, radians.
+const ASLANT: f64 = 0.2;
+const MOST_ASLANT: f64 = 0.6;
 /// Width of a driveway, metres, most near the lower end, and depth of its surface on the map.
 /// Recorded ones have medians of 4.9 and 9.7.
 const WIDTH: std::ops::Range<f64> = 3.2..10.0;
@@ -112,9 +115,13 @@ pub(crate) fn parked(
             size[0] = size[0].min(6.0);
             size[1] = size[1].min(2.2);
             let x = (f64::from(k) - f64::from(n - 1) / 2.0) * 2.7;
-            let y = DEPTH + 0.6 + size[0] / 2.0 + rng.random_range(0.0..2.5);
+            let y = size[0] / 2.0 + rng.random_range(PLACE);
             let nose_in = if rng.random_bool(0.7) { 0.5 } else { -0.5 };
-            let turn = nose_in * std::f64::consts::PI + rng.random_range(-0.05..0.05);
+            let aslant = match rng.random_bool(ASLANT) {
+                true => rng.random_range(-MOST_ASLANT..MOST_ASLANT),
+                false => rng.random_range(-0.05..0.05),
+            };
+            let turn = nose_in * std::f64::consts::PI + aslant;
             let pose = driveway.curb * Pose::new(x + rng.random_range(-0.15..0.15), y, turn);
             let far = network.lanes.iter().all(|lane| {
                 let foot = lane.track.pose_at(lane.track.project(pose.position));

@@ -8,7 +8,7 @@ use rand::Rng as _;
 use super::driveways::{self, Driveway};
 use crate::SynthesisConfig;
 use crate::curve::{Track, line};
-use crate::network::{LaneIdx, Network};
+use crate::network::{LaneIdx, Network, SLANT};
 use crate::traffic::{Jaywalk, Scenery, Span, Standing, draw_person_size, draw_real_size};
 
 /// From the middle of a parking strip to the curb, metres: half of the strip and the gutter of
@@ -21,6 +21,8 @@ const WIDEST: [f64; 2] = [2.3, 2.15];
 const LONGEST: [f64; 2] = [7.5, 5.5];
 /// Metres of curb without parked vehicles beside a way across the road. Chosen by eye.
 const JAYWALK_ROOM: f64 = 4.0;
+/// Share of the strips of bays that are slanted.
+const SLANTED: f64 = 0.4;
 /// From the middle of a sidewalk to the curb, metres: as `network/sidewalk.rs` lays them.
 const WALK_TO_CURB: f64 = 2.2;
 /// From the middle of a sidewalk to people who stand beside it, metres: out of the way of those who
@@ -83,12 +85,17 @@ fn parked(network: &Network, rng: &mut Rng) -> Vec<Standing> {
     }
     for strip in &network.bays {
         let fill = draw_fill(rng);
-        let spacing = rng.random_range(2.75..3.0);
+        let slant = if rng.random_bool(SLANTED) {
+            rng.random_range(SLANT) * if rng.random_bool(0.5) { 1.0 } else { -1.0 }
+        } else {
+            0.0
+        };
+        let spacing = rng.random_range(2.75..3.0) / f64::cos(slant);
         let n = ((strip.length() - 4.0) / spacing).max(0.0) as usize;
         for k in 0..n {
             if rng.random_bool(fill) {
                 let middle = strip.pose_at(2.0 + (k as f64 + 0.5) * spacing);
-                all.push(in_bay(middle, rng));
+                all.push(in_bay(middle * Pose::new(0.0, 0.0, slant), rng));
             }
         }
     }
