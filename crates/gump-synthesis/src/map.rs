@@ -111,7 +111,8 @@ pub(crate) fn build_map(network: &Network, placement: &Placement) -> Result<MapG
 }
 
 fn map_lane(network: &Network, i: LaneIdx, lane: &NetworkLane, placement: &Placement) -> Lane {
-    let (centerline, elevation) = placement.line(lane.track.points());
+    let drawn = lane.drawn.as_deref().unwrap_or(lane.track.points());
+    let (centerline, elevation) = placement.line(drawn);
     let ids = |lanes: &[LaneIdx]| lanes.iter().map(|&lane| lane_id(lane)).collect();
     let beside = |step: fn(&NetworkLane) -> Option<LaneIdx>| {
         let neighbors = std::iter::successors(step(lane), |&n| step(&network.lanes[n]));

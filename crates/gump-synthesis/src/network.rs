@@ -126,6 +126,8 @@ pub(crate) enum Turn {
 pub(crate) struct NetworkLane {
     /// Centre line.
     pub(crate) track: Track,
+    /// The centre line on the map, if it is not the track.
+    pub(crate) drawn: Option<Vec<DVec2>>,
     /// Full width, metres.
     pub(crate) width: f64,
     /// Speed limit, metres per second.

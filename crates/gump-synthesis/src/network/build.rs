@@ -197,6 +197,7 @@ impl Network {
             in_ring: a.in_ring && b.in_ring,
             connector: Some(connector),
             overlaps: Vec::new(),
+            drawn: None,
         };
         let idx = self.lanes.len();
         self.lanes.push(lane);
@@ -299,6 +300,7 @@ fn road_lane(road: &RoadPlan, forward: bool, track: Track) -> NetworkLane {
         in_ring: road.ring,
         connector: None,
         overlaps: Vec::new(),
+        drawn: None,
     }
 }
 

@@ -2,7 +2,8 @@
 //!
 //! `dress` adds side roads, car parks and parking to a plan, `bumps` and `driveways` what their
 //! names say; `scenery` adds parked vehicles, standing pedestrians and crossing ones anywhere on the
-//! network; `manoeuvres` and `walkers` add motion in car parks; this module combines them. Numbers and shares are fitted by hand to
+//! network; `manoeuvres` and `walkers` add motion in car parks; `turns` changes how the map shows
+//! turns; this module combines them. Numbers and shares are fitted by hand to
 //! `configs/targets/waymo-like.toml` (docs/results/0017-recorded-like.md); distances that no target
 //! measures are chosen by eye.
 
@@ -11,6 +12,7 @@ mod dress;
 mod driveways;
 mod manoeuvres;
 mod scenery;
+mod turns;
 mod walkers;
 
 use std::ops::RangeInclusive;
@@ -36,11 +38,11 @@ const FAMILIES: [(RoadFamily, u32); 9] = [
     (RoadFamily::StopCrossing, 16),
     (RoadFamily::TeeJunction, 8),
     (RoadFamily::Roundabout, 2),
-    (RoadFamily::Arterial, 36),
+    (RoadFamily::Arterial, 44),
     (RoadFamily::CurvedRoad, 8),
-    (RoadFamily::OnRamp, 18),
+    (RoadFamily::OnRamp, 22),
     (RoadFamily::MidBlockCrosswalk, 8),
-    (RoadFamily::Grid, 14),
+    (RoadFamily::Grid, 10),
 ];
 // Some formats state no limits, signs or lights (docs/decisions/0014-unknown-inputs.md). The shares
 // are chosen by hand, so that a network meets both.
@@ -120,6 +122,7 @@ pub(crate) fn draw_scenario(
     hide_car_parks(&mut network, ego, &mut rng);
     let is_mapped = |lane: &LaneId| !network.unmapped.iter().any(|&i| lane_id(i) == *lane);
     route.lanes.retain(is_mapped);
+    turns::widen(&mut network, &mut rng);
     network.hides_limits = rng.random_bool(NO_LIMITS);
     if rng.random_bool(NO_SIGNS) {
         network.furniture.stop_signs.clear();
