@@ -2,6 +2,7 @@
 
 use std::sync::OnceLock;
 
+use gump_geometry::{Pose, angle_difference};
 use gump_metrics::statistics::{Statistic as M, Statistics};
 use gump_scene::{Agent, AgentKind, AreaKind, LaneKind, Scenario, Seed};
 use gump_synthesis::{Profile, RoadFamily, SynthesisConfig, Tracker, track};
@@ -152,6 +153,68 @@ fn vehicles_pass_those_that_are_parked_partly_in_the_lane() {
     assert!((0.6..1.6).contains(&mean), "{mean} m between the sides");
 }
 
+/// The nearest point of a lane within reach whose direction suits, and the pose relative to it.
+fn on_lane(scene: &Scenario, pose: Pose, suits: impl Fn(Pose) -> bool) -> Option<Pose> {
+    let lanes = scene.map.lanes().iter();
+    let places = lanes.filter_map(|lane| {
+        let foot = lane.centerline.project(pose.position);
+        let local = lane.centerline.pose_at(foot.arc_length).inverse() * pose;
+        suits(local).then_some((foot.distance, local))
+    });
+    let nearest = places.min_by(|a, b| a.0.total_cmp(&b.0));
+    nearest.map(|(_, local)| local)
+}
+
+/// 31 % of the recorded ones do.
+#[test]
+fn many_that_are_parked_off_the_lanes_stand_aslant() {
+    let (mut all, mut aslant) = (0, 0);
+    for scene in seen() {
+        for agent in scene.log[0]
+            .agents()
+            .iter()
+            .filter(|a| is_parked(&scene, a))
+        {
+            let Some(local) = on_lane(&scene, agent.state.pose, |_| true) else {
+                continue;
+            };
+            if local.position.y.abs() > 1.5 {
+                all += 1;
+                aslant += usize::from((0.2..0.97).contains(&local.heading.cos().abs()));
+            }
+        }
+    }
+    let share = aslant as f64 / f64::from(all);
+    assert!((0.1..0.45).contains(&share), "{aslant} of {all}");
+}
+
+/// Recorded ones are 0.7 m inside (median).
+#[test]
+fn vehicles_turn_inside_of_the_centre_line() {
+    let mut inside = Vec::new();
+    for scene in clean() {
+        for agent in scene.log[scene.now].agents() {
+            let later = scene.log[scene.now + 5].agent(agent.id);
+            let Some(later) = later.filter(|_| agent.kind == AgentKind::Vehicle) else {
+                continue;
+            };
+            let turned = angle_difference(later.state.pose.heading, agent.state.pose.heading);
+            let ahead = |local: Pose| local.heading.cos() > 0.7;
+            let local = on_lane(scene, later.state.pose, ahead);
+            if let Some(local) = local.filter(|local| local.position.y.abs() < 2.5)
+                && turned.abs() > 0.08
+                && later.state.speed() > 1.0
+            {
+                inside.push(local.position.y * turned.signum());
+            }
+        }
+    }
+    let n = inside.len();
+    let mean = inside.iter().sum::<f64>() / n as f64;
+    assert!(n > 30, "{n} turn");
+    assert!((0.15..0.9).contains(&mean), "{mean} m");
+}
+
 #[test]
 fn shares_are_those_of_recordings() {
     let mut statistics = Statistics::default();
@@ -294,7 +357,7 @@ fn half_of_the_drivers_roll_over_stop_lines() {
             let before = |state: &gump_scene::AgentState| {
                 let ahead = |line: &gump_geometry::Pose| {
                     let local = line.inverse() * state.pose.position;
-                    let turn = gump_geometry::angle_difference(state.pose.heading, line.heading);
+                    let turn = angle_difference(state.pose.heading, line.heading);
                     let near = local.y.abs() < 2.0 && turn.abs() < 0.8;
                     (near && local.x > -12.0 && local.x < 4.0).then_some(local.x)
                 };
