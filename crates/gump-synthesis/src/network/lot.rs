@@ -4,7 +4,7 @@
 use std::ops::RangeInclusive;
 
 use gump_geometry::{DVec2, Polygon, Pose, wrap_angle};
-use gump_scene::{AreaKind, Rng};
+use gump_scene::{AreaKind, Rng, RoadEdgeKind};
 use rand::Rng as _;
 
 use crate::curve::Track;
@@ -24,6 +24,8 @@ const TURNED: f64 = 0.45;
 const MOST_TURNED: f64 = 0.8;
 const SLANTED: f64 = 0.4;
 pub(crate) const SLANT: std::ops::Range<f64> = 0.3..0.8;
+/// Share of such lots with a curb on the three sides away from the road.
+const ENCLOSED: f64 = 0.6;
 /// Depth of a place, metres: vehicles that park are no longer.
 const DEPTH: f64 = 5.6;
 /// Width of the aisle between two pairs of rows, metres.
@@ -124,6 +126,10 @@ impl Network {
                     position: corner(x, row_start(set_back, row) + DEPTH / 2.0),
                     heading,
                 });
+            }
+            if is_real && rng.random_bool(ENCLOSED) {
+                let edge = [ring[1], ring[2], ring[3], ring[0]].to_vec();
+                self.furniture.edges.push((RoadEdgeKind::Boundary, edge));
             }
             self.furniture
                 .areas

@@ -1,7 +1,7 @@
 //! Scenes with the statistics of recorded ones: the road families with additional features.
 //!
-//! `dress` adds side roads, car parks and parking to a plan, `bumps` and `driveways` what their
-//! names say; `scenery` adds parked vehicles, standing pedestrians and crossing ones anywhere on the
+//! `dress` adds side roads, car parks and parking to a plan, `bumps`, `driveways` and `islands` what
+//! their names say; `scenery` adds parked vehicles, standing pedestrians and crossing ones anywhere on the
 //! network; `manoeuvres` and `walkers` add motion in car parks; `turns` changes how the map shows
 //! turns; this module combines them. Numbers and shares are fitted by hand to
 //! `configs/targets/waymo-like.toml` (docs/results/0017-recorded-like.md); distances that no target
@@ -10,6 +10,7 @@
 mod bumps;
 mod dress;
 mod driveways;
+mod islands;
 mod manoeuvres;
 mod scenery;
 mod turns;
@@ -22,6 +23,7 @@ use gump_scene::{AgentId, AgentKind, LaneId, Rng, Scenario, Seed};
 use rand::Rng as _;
 
 use self::driveways::Driveway;
+use self::islands::Island;
 use crate::layout::draw_plan;
 use crate::map::{build_map, lane_id};
 use crate::network::Network;
@@ -102,7 +104,8 @@ pub(crate) fn draw_scenario(
     network.lay_lots(&plan, &trimmed, n_lots, 1..=6, &mut rng);
     let driveways = driveways::lay(&mut network, &plan, &trimmed, &mut rng);
     bumps::lay(&mut network, &plan, &trimmed, &mut rng);
-    let demand = draw_demand(config, &network, &driveways, &mut rng);
+    let islands = islands::lay(&mut network, &mut rng);
+    let demand = draw_demand(config, &network, (&driveways, &islands), &mut rng);
     let traffic_rng = seed.fork(attempt).fork(1).rng();
     let mut traffic = TrafficSimulation::new(&network, demand, config.dt, traffic_rng);
     for _ in 0..(config.warmup_s / config.dt).round() as usize {
@@ -151,7 +154,7 @@ pub(crate) fn draw_scenario(
 fn draw_demand(
     config: &SynthesisConfig,
     network: &Network,
-    driveways: &[Driveway],
+    (driveways, islands): (&[Driveway], &[Island]),
     rng: &mut Rng,
 ) -> Demand {
     let metres: f64 = network
@@ -182,7 +185,7 @@ fn draw_demand(
         people,
         bicycles: draw_skewed(&config.bicycles, 4.0, config.density, rng),
         arrivals: rng.random_range(0.05..0.25) * busy * config.density,
-        scenery: scenery::draw(network, config, (driveways, bustle), rng),
+        scenery: scenery::draw(network, config, (driveways, islands, bustle), rng),
     }
 }
 

@@ -6,6 +6,7 @@ use gump_scene::{AgentKind, LaneKind, Rng};
 use rand::Rng as _;
 
 use super::driveways::{self, Driveway};
+use super::islands::Island;
 use crate::SynthesisConfig;
 use crate::curve::{Track, line};
 use crate::network::{LaneIdx, Network, SLANT};
@@ -37,7 +38,7 @@ const MOST_PARKED: f64 = 190.0;
 pub(crate) fn draw(
     network: &Network,
     config: &SynthesisConfig,
-    (driveways, bustle): (&[Driveway], f64),
+    (driveways, islands, bustle): (&[Driveway], &[Island], f64),
     rng: &mut Rng,
 ) -> Scenery {
     let jaywalks = draw_jaywalks(network, rng);
@@ -57,7 +58,9 @@ pub(crate) fn draw(
             let foot = way.track.pose_at(way.track.project(at)).position;
             foot.distance(at) > JAYWALK_ROOM
         };
-        jaywalks.iter().all(off) && !driveways.iter().any(|d| d.is_blocked_by(body))
+        jaywalks.iter().all(off)
+            && !driveways.iter().any(|d| d.is_blocked_by(body))
+            && !islands.iter().any(|island| island.is_under(at))
     });
     let share = rng.random_range(0.0..0.9);
     standing.extend(driveways::parked(network, driveways, share, rng));
