@@ -308,6 +308,8 @@ fn the_recorded_stages_of_the_relative_network_can_be_run() {
         let network = relative::load(&weights, &Device::Cpu).unwrap();
         assert_eq!(network.config(), shipped.config());
     }
+    on_these("relative-parking.toml");
+    place.results("relative-parking.toml --steps 1", "parking");
     // Realism needs road edges, which the scenes here do not have.
     on_these("relative-rewards.toml");
     place.fails(
