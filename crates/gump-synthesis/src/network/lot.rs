@@ -58,9 +58,11 @@ impl Network {
             let spacing = rng.random_range(2.7..3.1);
             // A range of one value draws nothing more, which keeps the scenes of lots of one row.
             let is_real = rows.start() != rows.end();
-            let mut draw = |share: f64, angles: std::ops::Range<f64>| {
-                let is_so = is_real && rng.random_bool(share);
-                is_so.then(|| rng.random_range(angles)).unwrap_or_default()
+            let mut draw = |share: f64, angles: std::ops::Range<f64>| match is_real
+                && rng.random_bool(share)
+            {
+                true => rng.random_range(angles),
+                false => 0.0,
             };
             let turned = draw(TURNED, -MOST_TURNED..MOST_TURNED);
             let slant = draw(SLANTED, SLANT) * if draw(0.5, 0.0..1.0) > 0.0 { 1.0 } else { -1.0 };

@@ -22,12 +22,8 @@ use crate::relative::drives::WARM_UP;
 const MOVES_M: f64 = 5.0;
 /// ... where those are after at least this many frames: two seconds suffice to brake.
 const AHEAD: usize = 4;
-/// Standing agents are in the way, with this probability, or beside it: their centres are this far
-/// from the path, metres, vehicles and others. In between, drivers would go around them where there is
-/// room, and a network that does not know it yet would learn from its own drives to stop.
-const IN_THE_WAY: f64 = 0.4;
-const ON_PATH_M: [f64; 2] = [0.8, 0.4];
-const BESIDE_M: [std::ops::Range<f64>; 2] = [2.3..4.5, 1.6..4.5];
+/// Deviation of standing agents from the path, metres: from in the way to beside it.
+const BESIDE_M: f64 = 2.2;
 /// Deviation of the heading of standing agents from the path, radians.
 const TURNED: f64 = 0.15;
 /// Deviation of the place where people meet the path, metres.
@@ -220,12 +216,7 @@ fn standing(on: Pose, rng: &mut Rng) -> Newcomer {
             sized: true,
         },
     };
-    let narrow = usize::from(body.kind != AgentKind::Vehicle);
-    let aside = match rng.random_bool(IN_THE_WAY) {
-        true => ON_PATH_M[narrow] * (2.0 * rng.random::<f64>() - 1.0),
-        false if rng.random_bool(0.5) => rng.random_range(BESIDE_M[narrow].clone()),
-        false => -rng.random_range(BESIDE_M[narrow].clone()),
-    };
+    let aside = BESIDE_M * standard_normal(rng);
     let turned = match body.kind {
         AgentKind::Pedestrian => std::f64::consts::TAU * rng.random::<f64>(),
         _ => TURNED * standard_normal(rng),
