@@ -355,7 +355,7 @@ fn half_of_the_drivers_roll_over_stop_lines() {
             let states: Vec<_> = of_frames.map(|agent| agent.state).collect();
             // Metres of the centre from the line, where the vehicle drives towards it.
             let before = |state: &gump_scene::AgentState| {
-                let ahead = |line: &gump_geometry::Pose| {
+                let ahead = |line: &Pose| {
                     let local = line.inverse() * state.pose.position;
                     let turn = angle_difference(state.pose.heading, line.heading);
                     let near = local.y.abs() < 2.0 && turn.abs() < 0.8;

@@ -64,8 +64,8 @@ pub(crate) struct Standing {
 /// about as many vehicles leave the road as in recordings
 /// (docs/results/0025-where-realism-is-lost.md).
 const INTO_YARDS: f64 = 0.5;
-/// Cyclists ride at most this far from the lane's centre, metres: in wide lanes vehicles park beside
-/// them. Lanes without parked vehicles are narrower.
+/// Cyclists of scenes like recorded ones ride at most this far from the lane's centre, metres: in wide
+/// lanes vehicles park beside them.
 const BICYCLE_ASIDE: f64 = 1.35;
 /// From this limit on a lane of a scene like a recorded one is fully used, m/s. Fitted by hand:
 /// recorded traffic drives faster than a plain draw of lanes.
@@ -255,7 +255,11 @@ impl TrafficSimulation<'_> {
         }
         vehicle.speed = speed;
         if kind == AgentKind::Bicycle && !l.is_bike_lane() {
-            vehicle.settle(-(l.width / 2.0 - 0.55).min(BICYCLE_ASIDE));
+            let most = match self.demand.scenery.is_real {
+                true => BICYCLE_ASIDE,
+                false => f64::INFINITY,
+            };
+            vehicle.settle(-(l.width / 2.0 - 0.55).min(most));
         }
         if self.demand.scenery.is_real && kind == AgentKind::Vehicle {
             // Hardly anybody drives in the very middle of the lane.
