@@ -11,7 +11,7 @@ mod lot;
 mod sidewalk;
 mod signal;
 
-pub(crate) use lot::SLANT;
+pub(crate) use lot::draw_slant;
 pub(crate) use signal::Cycle;
 
 use std::collections::BTreeSet;

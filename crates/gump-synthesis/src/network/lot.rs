@@ -18,12 +18,12 @@ const SET_BACK: f64 = 7.0;
 /// The same in scenes like recorded ones, where vehicles stand right behind the sidewalk or farther
 /// back.
 const REAL_SET_BACK: std::ops::Range<f64> = 3.5..9.0;
-/// Share of lots of such scenes that are turned against the road, and that have slanted places;
-/// radians. A third of the recorded vehicles that stand off lanes stand aslant to the nearest one.
+/// Share of lots of such scenes that are turned against the road, share of lots and of strips of bays
+/// that have slanted places, and by how much, radians. A third of the recorded vehicles that stand off lanes stand aslant to the nearest one.
 const TURNED: f64 = 0.45;
 const MOST_TURNED: f64 = 0.8;
 const SLANTED: f64 = 0.4;
-pub(crate) const SLANT: std::ops::Range<f64> = 0.3..0.8;
+const SLANT: std::ops::Range<f64> = 0.3..0.8;
 /// Share of such lots with a curb on the three sides away from the road.
 const ENCLOSED: f64 = 0.6;
 /// Depth of a place, metres: vehicles that park are no longer.
@@ -58,19 +58,15 @@ impl Network {
             let spacing = rng.random_range(2.7..3.1);
             // A range of one value draws nothing more, which keeps the scenes of lots of one row.
             let is_real = rows.start() != rows.end();
-            let mut draw = |share: f64, angles: std::ops::Range<f64>| match is_real
-                && rng.random_bool(share)
-            {
-                true => rng.random_range(angles),
-                false => 0.0,
+            let (slant, turned, set_back) = match is_real {
+                true => (
+                    draw_slant(rng),
+                    draw_turned(rng),
+                    rng.random_range(REAL_SET_BACK),
+                ),
+                false => (0.0, 0.0, SET_BACK),
             };
-            let turned = draw(TURNED, -MOST_TURNED..MOST_TURNED);
-            let slant = draw(SLANTED, SLANT) * if draw(0.5, 0.0..1.0) > 0.0 { 1.0 } else { -1.0 };
             let spacing = spacing / f64::cos(slant);
-            let set_back = match is_real {
-                true => rng.random_range(REAL_SET_BACK),
-                false => SET_BACK,
-            };
             let half = spacing * f64::from(n_places) / 2.0;
             if lots.len() == n || r.freeway || r.ring || track.length() < 2.0 * half + 12.0 {
                 continue;
@@ -146,6 +142,23 @@ impl Network {
             .iter()
             .flat_map(|walk| walk.track.points())
             .any(|point| ground.signed_distance(*point) < CLEARANCE)
+    }
+}
+
+/// The angle of the places of a lot or strip to the right one, radians; 0 for most.
+pub(crate) fn draw_slant(rng: &mut Rng) -> f64 {
+    if !rng.random_bool(SLANTED) {
+        return 0.0;
+    }
+    let slant = rng.random_range(SLANT);
+    if rng.random_bool(0.5) { slant } else { -slant }
+}
+
+/// The angle of a lot to its road, radians; 0 for most.
+fn draw_turned(rng: &mut Rng) -> f64 {
+    match rng.random_bool(TURNED) {
+        true => rng.random_range(-MOST_TURNED..MOST_TURNED),
+        false => 0.0,
     }
 }
 

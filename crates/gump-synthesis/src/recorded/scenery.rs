@@ -9,7 +9,7 @@ use super::driveways::{self, Driveway};
 use super::islands::Island;
 use crate::SynthesisConfig;
 use crate::curve::{Track, line};
-use crate::network::{LaneIdx, Network, SLANT};
+use crate::network::{LaneIdx, Network, draw_slant};
 use crate::traffic::{Jaywalk, Scenery, Span, Standing, draw_person_size, draw_real_size};
 
 /// From the middle of a parking strip to the curb, metres: half of the strip and the gutter of
@@ -22,8 +22,6 @@ const WIDEST: [f64; 2] = [2.3, 2.15];
 const LONGEST: [f64; 2] = [7.5, 5.5];
 /// Metres of curb without parked vehicles beside a way across the road. Chosen by eye.
 const JAYWALK_ROOM: f64 = 4.0;
-/// Share of the strips of bays that are slanted.
-const SLANTED: f64 = 0.4;
 /// From the middle of a sidewalk to the curb, metres: as `network/sidewalk.rs` lays them.
 const WALK_TO_CURB: f64 = 2.2;
 /// From the middle of a sidewalk to people who stand beside it, metres: out of the way of those who
@@ -88,11 +86,7 @@ fn parked(network: &Network, rng: &mut Rng) -> Vec<Standing> {
     }
     for strip in &network.bays {
         let fill = draw_fill(rng);
-        let slant = if rng.random_bool(SLANTED) {
-            rng.random_range(SLANT) * if rng.random_bool(0.5) { 1.0 } else { -1.0 }
-        } else {
-            0.0
-        };
+        let slant = draw_slant(rng);
         let spacing = rng.random_range(2.75..3.0) / f64::cos(slant);
         let n = ((strip.length() - 4.0) / spacing).max(0.0) as usize;
         for k in 0..n {

@@ -21,7 +21,7 @@ use gump_model::local_context::LaneMap;
 use gump_model::relative::graph::{Lights, Shown};
 use gump_model::relative::grid::dequantize;
 use gump_model::relative::map::VectorMap;
-use gump_model::relative::sample::{State, Track, TrackDriver};
+use gump_model::relative::sample::{Track, TrackDriver};
 use gump_model::relative::{RelativeNetwork, RelativeWeights};
 use gump_scene::{AgentKind, LightState, MapGraph, Seed};
 use rand::Rng as _;
@@ -41,8 +41,8 @@ const METRES_PER_RADIAN: f64 = 2.0;
 const PARKED_M: f64 = 0.5;
 /// ... off lanes: farther than this from their centre lines, metres. Both were chosen by hand.
 const OFF_LANE_M: f64 = 1.5;
-/// A vehicle waits at red if it stands as its log does, within this, metres, while its log moves no
-/// farther in the next step, ...
+/// A vehicle waits at red if its log moves no farther than this in the next step, metres, it is itself
+/// as near to its log, ...
 const WAITS_M: f64 = 0.2;
 /// ... and a lane at red starts ahead of it, this far at most, and this far aside, metres. All were
 /// chosen by hand.
@@ -184,6 +184,11 @@ impl TrackDriver for NetworkDriver {
             true => tracks.iter().map(stays).collect(),
             false => Vec::new(),
         };
+        // Agents that are led away take their own poses for logged ones.
+        let logs: Vec<Vec<Option<Pose>>> = match ruled {
+            true => tracks.iter().map(log_of).collect(),
+            false => Vec::new(),
+        };
         let memory = self.engine.remember(map);
         let mut members: Vec<Option<ObservedAgent>> = tracks.iter().map(|_| None).collect();
         let (mut room, mut hidden) = (Workspace::default(), Vec::new());
@@ -218,17 +223,16 @@ impl TrackDriver for NetworkDriver {
             let seed = seed.fork(t as u64);
             if let Some(lane_map) = &lane_map {
                 let red = red_lanes(lights, streets);
-                let waits = |track: &Track| {
-                    let both = track.states[t].zip(track.states[t + 1]);
-                    let is_vehicle = track.body.kind == AgentKind::Vehicle;
-                    is_vehicle && both.is_some_and(|(now, next)| waits(&now, &next, &red))
+                let waits = |(&a, now): (&usize, &Shown)| {
+                    tracks[a].body.kind == AgentKind::Vehicle
+                        && waits(now.pose, [logs[a][t], logs[a][t + 1]], &red)
                 };
-                let stay = here.iter().map(|&a| stays[a] || waits(&tracks[a]));
-                let stay: Vec<bool> = stay.collect();
+                let stay = here.iter().zip(&agents);
+                let stay: Vec<bool> = stay.map(|one| stays[*one.0] || waits(one)).collect();
                 let crowd = (&agents[..], &stay[..]);
                 let moves = self.moves_by_the_rules(crowd, lane_map, &hidden, seed, &mut room);
-                for (((&a, now), step), stays) in here.iter().zip(&agents).zip(moves).zip(stay) {
-                    if let Some(next) = tracks[a].states[t + 1].as_mut().filter(|_| !stays) {
+                for ((&a, now), step) in here.iter().zip(&agents).zip(moves) {
+                    if let Some(next) = tracks[a].states[t + 1].as_mut().filter(|_| !stays[a]) {
                         *next = next.led_to(now.pose * step);
                     }
                 }
@@ -330,18 +334,26 @@ fn red_lanes(lights: &Lights, streets: &MapGraph) -> Vec<Pose> {
     red.filter_map(|(id, _, _)| start(*id)).collect()
 }
 
-/// Whether an agent stands where its log does, and a light ahead is the reason.
-fn waits(now: &State, next: &State, red: &[Pose]) -> bool {
-    let apart = |a: Pose, b: Pose| a.position.distance(b.position);
+/// The logged poses of a track.
+fn log_of(track: &Track) -> Vec<Option<Pose>> {
+    let states = track.states.iter();
+    states.map(|state| Some((*state)?.logged)).collect()
+}
+
+/// Whether an agent that is `here` stands where its log does, `now` and in the next frame, and a lane at
+/// red ahead is the reason.
+pub(super) fn waits(here: Pose, [now, next]: [Option<Pose>; 2], red: &[Pose]) -> bool {
+    let (Some(now), Some(next)) = (now, next) else {
+        return false;
+    };
+    let near = |a: Pose, b: Pose| a.position.distance(b.position) < WAITS_M;
     let ahead = |line: &Pose| {
-        let local = now.shown.inverse() * *line;
+        let local = here.inverse() * *line;
         (0.0..RED_AHEAD_M).contains(&local.position.x)
             && local.position.y.abs() < RED_ASIDE_M
             && local.heading.cos() > 0.7
     };
-    apart(now.logged, next.logged) < WAITS_M
-        && apart(now.shown, now.logged) < WAITS_M
-        && red.iter().any(ahead)
+    near(now, next) && near(here, now) && red.iter().any(ahead)
 }
 
 /// Distance between two poses, metres.

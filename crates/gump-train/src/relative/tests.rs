@@ -2,6 +2,7 @@
 
 use candle_core::Device;
 use gump_engine::relative::{RelativeSampling, RelativeWorld};
+use gump_geometry::Pose;
 use gump_model::checkpoint;
 use gump_model::relative::graph::{Body, NODE_NUMBERS};
 use gump_model::relative::sample::{SampleConfig, State, Track, draw};
@@ -234,16 +235,21 @@ fn agents_that_go_their_own_ways_learn_what_they_did() {
     assert_eq!(drawn(1.0).nodes, ruled.nodes);
 }
 
-/// A random network moves whoever it may; parked vehicles stay, and that they do is learned.
-#[test]
-fn parked_vehicles_stay_where_the_log_has_them() {
+/// A random network that drives under the rules.
+fn under_the_rules() -> drives::NetworkDriver {
     let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
     let config = RelativeDrives {
         share: 1.0,
         ruled: 1.0,
         ..RelativeDrives::default()
     };
-    let driver = drives::NetworkDriver::new(&network, &config).unwrap();
+    drives::NetworkDriver::new(&network, &config).unwrap()
+}
+
+/// A random network moves whoever it may; parked vehicles stay, and that they do is learned.
+#[test]
+fn parked_vehicles_stay_where_the_log_has_them() {
+    let driver = under_the_rules();
     let scenario = fixture::scenario(
         "lane 1: 0,0 200,0
          ego vehicle 0: 10,0 velocity 8,0
@@ -269,13 +275,7 @@ fn parked_vehicles_stay_where_the_log_has_them() {
 /// A random network does not wait at red; a vehicle whose log does is held there.
 #[test]
 fn vehicles_that_wait_at_red_do_not_learn_to_start() {
-    let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
-    let config = RelativeDrives {
-        share: 1.0,
-        ruled: 1.0,
-        ..RelativeDrives::default()
-    };
-    let driver = drives::NetworkDriver::new(&network, &config).unwrap();
+    let driver = under_the_rules();
     let starts = |light: &str| {
         let text = format!(
             "lane 1: 0,0 40,0
@@ -290,6 +290,25 @@ fn vehicles_that_wait_at_red_do_not_learn_to_start() {
     };
     assert_eq!(starts("red"), 0);
     assert!(starts("green") > 0);
+}
+
+#[test]
+fn who_waits_at_red_stands_where_its_log_does() {
+    let at = |x: f64| Pose::new(x, 0.0, 0.0);
+    let waits = |here, now, next, line| {
+        drives::waits(at(here), [Some(at(now)), Some(at(next))], &[at(line)])
+    };
+    assert!(waits(30.0, 30.0, 30.0, 35.0));
+    // Its log goes on, or comes to where the vehicle is already on its way.
+    assert!(!waits(30.0, 30.0, 31.0, 35.0));
+    assert!(!waits(30.0, 27.0, 30.0, 35.0));
+    // It is not where its log is, the light is behind it, far away, or of another direction.
+    assert!(!waits(29.0, 30.0, 30.0, 35.0));
+    assert!(!waits(30.0, 30.0, 30.0, 25.0));
+    assert!(!waits(30.0, 30.0, 30.0, 100.0));
+    let (here, aside) = (at(30.0), Pose::new(35.0, 0.0, 1.5));
+    assert!(!drives::waits(here, [Some(here); 2], &[aside]));
+    assert!(!drives::waits(here, [Some(here), None], &[at(35.0)]));
 }
 
 /// A crowd joins samples under the rules, in which nobody stands inside another at first.
