@@ -8,7 +8,7 @@ use gump_model::relative::graph::{Body, NODE_NUMBERS};
 use gump_model::relative::sample::{SampleConfig, State, Track, draw};
 use gump_model::relative::{RelativeConfig, RelativeNetwork, grid, is_relative, load, sample};
 use gump_rollout::{SimulateConfig, Start, WorldModel as _, simulate};
-use gump_scene::{Scenario, Seed, fixture};
+use gump_scene::{MapGraph, Scenario, Seed, fixture};
 
 use super::*;
 
@@ -290,6 +290,23 @@ fn vehicles_that_wait_at_red_do_not_learn_to_start() {
     };
     assert_eq!(starts("red"), 0);
     assert!(starts("green") > 0);
+}
+
+#[test]
+fn a_lane_goes_on_without_junctions_and_stop_signs() {
+    let scenario = fixture::scenario(
+        "lane 1: 0,0 60,0 next 2\nlane 2: 60,0 90,0 next 3\nlane 3: 90,0 200,0\n\
+         ego vehicle 0: 5,0",
+    )
+    .unwrap();
+    let mut parts = scenario.map.parts().clone();
+    parts.lanes[1].in_intersection = true;
+    let map = MapGraph::new(parts).unwrap();
+    let goes_on = |x, y, heading| drives::goes_on(&map, Pose::new(x, y, heading));
+    assert!(goes_on(10.0, 0.5, 0.0) && goes_on(70.0, 0.0, 0.1) && goes_on(100.0, 0.0, 0.0));
+    // A junction ahead, the end of the road, off the lane, across it.
+    assert!(!goes_on(40.0, 0.0, 0.0) && !goes_on(180.0, 0.0, 0.0));
+    assert!(!goes_on(10.0, 1.5, 0.0) && !goes_on(10.0, 0.0, 1.0));
 }
 
 #[test]
