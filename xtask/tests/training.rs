@@ -310,6 +310,8 @@ fn the_recorded_stages_of_the_relative_network_can_be_run() {
     }
     on_these("relative-parking.toml");
     place.results("relative-parking.toml --steps 1", "parking");
+    on_these("placement.toml");
+    place.results("placement.toml --steps 2", "placement");
     // Realism needs road edges, which the scenes here do not have.
     on_these("relative-rewards.toml");
     place.fails(

@@ -413,6 +413,7 @@ impl RolloutState {
             comes_to: ego,
             is_guided: true,
             manner: Manner::default(),
+            places: None,
         }
     }
 }

@@ -6,14 +6,14 @@ use std::sync::Arc;
 
 use gump_engine::cpu::{Engine, Job};
 use gump_engine::placement::rules::{Rules, state_of};
-use gump_engine::request::Request;
+use gump_engine::request::{Guide, Request};
 use gump_engine::temporal_ensemble::ChunkBuffer;
 use gump_engine::{EngineError, TransformerWorld};
 use gump_geometry::OrientedBox;
 use gump_model::decoder::Bins;
 use gump_model::local_frame::LocalFrame;
 use gump_model::placed_slot::PlacedSlot;
-use gump_scene::AgentKind;
+use gump_scene::{AgentKind, Seed};
 use gump_tokenizer::{Key, QuantizedState};
 use rayon::prelude::*;
 
@@ -22,6 +22,9 @@ use crate::{GenerateError, Placement, reason};
 
 /// Number of draws of an object made at once after the first: most objects need no more. Not tuned.
 const VOLLEY: usize = 4;
+
+/// Separates the draw of a place from those of the fields.
+const PLACE: u64 = 1 << 32;
 
 /// Gives every unfinished scene its next object; false once all are finished.
 pub(crate) fn advance(
@@ -119,9 +122,15 @@ fn draw(engine: &Engine, mut queries: Vec<Query<'_, '_>>) {
     while !queries.is_empty() {
         let tries = queries[0].partial.prepared.request.config.tries;
         let n = if drawn == 0 { 1 } else { VOLLEY }.min(tries - drawn);
+        let rules: Vec<Arc<Rules>> = queries
+            .iter()
+            .flat_map(|query| (0..n).map(|i| rules(query, drawn + i)))
+            .collect();
         let requests: Vec<Request> = queries
             .iter()
-            .flat_map(|query| (0..n).map(|i| request(query, drawn + i)))
+            .flat_map(|query| (0..n).map(move |i| (query, drawn + i)))
+            .zip(&rules)
+            .map(|((query, attempt), rules)| request(query, rules, attempt))
             .collect();
         let hidden: Vec<f32> = queries
             .iter()
@@ -136,10 +145,11 @@ fn draw(engine: &Engine, mut queries: Vec<Query<'_, '_>>) {
         let is_late = 2 * drawn > tries;
         let judged: Vec<Vec<Result<Found, String>>> = queries
             .par_iter()
-            .zip(bins.par_chunks(n))
-            .map(|(query, bins)| {
+            .zip(bins.par_chunks(n).zip(rules.par_chunks(n)))
+            .map(|(query, (bins, rules))| {
                 bins.iter()
-                    .map(|bins| judge(query, bins, is_late))
+                    .zip(rules)
+                    .map(|(bins, rules)| judge(query, rules, bins, is_late))
                     .collect()
             })
             .collect();
@@ -172,20 +182,35 @@ fn draw(engine: &Engine, mut queries: Vec<Query<'_, '_>>) {
     }
 }
 
-fn request(query: &Query<'_, '_>, attempt: usize) -> Request {
-    let stream = query
-        .partial
-        .stream(2 * query.partial.agents.len() as u64 + 2);
-    let rules = Arc::clone(&query.rules);
+/// The seed of one attempt.
+fn stream(query: &Query<'_, '_>, attempt: usize) -> Seed {
+    let n_placed = query.partial.agents.len() as u64;
+    query.partial.stream(2 * n_placed + 2).fork(attempt as u64)
+}
+
+/// The constraints of one attempt, with a place of its own.
+fn rules(query: &Query<'_, '_>, attempt: usize) -> Arc<Rules> {
+    let Some(draw) = &query.rules.places else {
+        return Arc::clone(&query.rules);
+    };
+    let seed = stream(query, attempt).fork(PLACE);
+    Arc::new(Rules {
+        places: Some(draw.again(seed)),
+        ..Rules::clone(&query.rules)
+    })
+}
+
+fn request(query: &Query<'_, '_>, rules: &Arc<Rules>, attempt: usize) -> Request {
+    let guide: Arc<dyn Guide> = Arc::<Rules>::clone(rules);
     Request {
         local_frame: LocalFrame::SCENE,
         forced: query.partial.given(query.key),
-        stream: stream.fork(attempt as u64),
+        stream: stream(query, attempt),
         near: None,
         ring: ChunkBuffer::default(),
         limits: None,
         frame: 0,
-        guide: Some(rules),
+        guide: Some(guide),
     }
 }
 
@@ -193,12 +218,17 @@ fn request(query: &Query<'_, '_>, attempt: usize) -> Request {
 type Found = (QuantizedState, OrientedBox);
 
 /// The drawn state, or the constraint it violates. The ego's box is given and therefore valid.
-fn judge(query: &Query<'_, '_>, bins: &Bins, is_late: bool) -> Result<Found, String> {
+fn judge(
+    query: &Query<'_, '_>,
+    rules: &Rules,
+    bins: &Bins,
+    is_late: bool,
+) -> Result<Found, String> {
     let state = state_of(bins);
     let prepared = query.partial.prepared;
     let (map, world_from_scene) = (&prepared.request.map, prepared.scene.world_from_scene);
-    let outline = query.rules.outline(&state, map, world_from_scene);
-    let broken = query.rules.broken(&state, &outline, map, world_from_scene);
+    let outline = rules.outline(&state, map, world_from_scene);
+    let broken = rules.broken(&state, &outline, map, world_from_scene);
     let stands = || stands_without(query, &state, &outline).filter(|_| !is_late);
     let broken = broken.or_else(stands);
     match broken {

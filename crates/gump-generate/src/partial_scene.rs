@@ -1,12 +1,15 @@
 //! A scene during generation: objects already placed, and those to come.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::sync::Arc;
 
 use gump_engine::cpu::{KvCache, Successor};
 use gump_engine::placement::births;
 use gump_engine::placement::births::NEWBORN_AT;
+use gump_engine::placement::network::PlacementScorer;
 use gump_engine::placement::object_spec::{Bounds, ObjectSpec, agent_of};
-use gump_engine::placement::rules::Rules;
+use gump_engine::placement::places::{PlacedVehicle, Places, Traffic};
+use gump_engine::placement::rules::{PlaceDraw, Rules};
 use gump_geometry::OrientedBox;
 use gump_model::decoder::{STATE_STEPS, STEPS};
 use gump_scene::{Agent, AgentId, AgentKind, Frame, Seed};
@@ -141,7 +144,31 @@ impl<'a> PartialScene<'a> {
         }
         let mut rules = self.prepared.rules(key.kind, &spec, &taken, &self.named);
         rules.manner.numbers = self.numbers(key);
+        let drawn = !key.is_ego() && rules.kind == AgentKind::Vehicle && rules.rows.is_empty();
+        if let Some((places, likely)) = self.prepared.places.as_ref().filter(|_| drawn) {
+            rules.places = rules.ground.as_ref().map(|_| {
+                let traffic = Arc::new(self.traffic(places));
+                PlaceDraw::new(
+                    PlacementScorer::shipped(),
+                    (Arc::clone(places), Arc::clone(likely)),
+                    traffic,
+                    self.prepared.request.config.parks_off_road,
+                    self.stream(2 * self.agents.len() as u64 + 2),
+                )
+            });
+        }
         rules
+    }
+
+    /// The vehicles that are already placed.
+    fn traffic(&self, places: &Places) -> Traffic {
+        let placed = self.agents.iter().zip(&self.boxes);
+        let vehicles = placed.filter(|(agent, _)| agent.key.kind == AgentKind::Vehicle);
+        let vehicles = vehicles.map(|(agent, outline)| PlacedVehicle {
+            outline: *outline,
+            speed: agent.state.velocity().length(),
+        });
+        Traffic::new(places, vehicles.collect())
     }
 
     /// The stratified numbers for the first draw of the object with this key, which is next.

@@ -5,7 +5,9 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use gump_engine::cpu::SceneMemory;
+use gump_engine::placement::network::PlacementScorer;
 use gump_engine::placement::object_spec::{ObjectSpec, agent_of};
+use gump_engine::placement::places::Places;
 use gump_engine::placement::rules::{Manner, Rules};
 use gump_engine::placement::spawn_map::SpawnMap;
 use gump_engine::scene::SceneContext;
@@ -30,6 +32,8 @@ pub(crate) struct Prepared<'a> {
     pub(super) objects: Vec<ObjectSpec>,
     grounds: BTreeMap<AgentKind, Arc<SpawnMap>>,
     lanes: BTreeMap<i64, Arc<SpawnMap>>,
+    /// The places of vehicles, where the placement network draws them.
+    pub(super) places: Option<(Arc<Places>, Arc<[bool]>)>,
     /// Boxes of static objects, scene frame.
     pub(super) fixtures: Vec<OrientedBox>,
     pub(super) sampling: SamplingConfig,
@@ -83,6 +87,13 @@ impl<'a> Prepared<'a> {
             objects,
             grounds,
             lanes,
+            places: (config.placement_network && config.placement == Placement::Guided).then(
+                || {
+                    let places = Places::new(&request.map, pose, &request.lights);
+                    let likely = PlacementScorer::shipped().likely(&places);
+                    (Arc::new(places), likely)
+                },
+            ),
             sampling: SamplingConfig {
                 temperature: Some(config.temperature),
                 top_k: config.top_k,
@@ -183,6 +194,7 @@ impl<'a> Prepared<'a> {
             comes_to: None,
             is_guided,
             manner: self.manner.clone(),
+            places: None,
         }
     }
 

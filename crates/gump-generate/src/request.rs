@@ -131,6 +131,14 @@ pub struct GenerateConfig {
     pub top_k: usize,
     /// The places allowed for objects.
     pub placement: Placement,
+    /// Whether the placement network draws the places of vehicles, with guided placement, and not
+    /// the sequence network, which knows little about where vehicles are (paper: no). Vehicles in a
+    /// row with others and those whose position is given are placed by their constraints.
+    pub placement_network: bool,
+    /// Whether the placement network may park vehicles beyond the edges of the road, on driveways
+    /// and in car parks, where two of five recorded vehicles are. Scenes then fail the check that
+    /// vehicles are on the road.
+    pub parks_off_road: bool,
     /// Whether a vehicle that stands in a lane needs a reason: a light, a sign, a junction or
     /// another agent ahead. In guided placement only. It makes scenes less like recorded ones, but
     /// their rollouts better.
@@ -176,6 +184,8 @@ impl Default for GenerateConfig {
             smoothing_bins: 0.7,
             smoothed_sizes: true,
             even: true,
+            placement_network: false,
+            parks_off_road: false,
             standing_has_reasons: false,
             top_k: 1000,
             placement: Placement::Guided,

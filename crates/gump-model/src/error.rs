@@ -91,8 +91,19 @@ pub enum WeightsError {
     #[error("expected a safetensors file ({0})")]
     NotSafetensors(safetensors::SafeTensorError),
     /// The weights are of another network.
-    #[error("expected weights of the relative network")]
-    OtherNetwork,
+    #[error("expected weights of the {expected} network")]
+    OtherNetwork {
+        /// The network that was expected.
+        expected: &'static str,
+    },
+    /// The network reads another number of properties than this version computes.
+    #[error("the network reads {found} properties of a place, expected {expected}")]
+    OtherInputs {
+        /// Number that this version computes.
+        expected: usize,
+        /// Number that the network reads.
+        found: usize,
+    },
     /// The header has no configuration.
     #[error("the header has no \"config\"")]
     NoConfig,

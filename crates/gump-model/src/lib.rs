@@ -50,6 +50,7 @@ pub mod mct;
 #[cfg(feature = "tensors")]
 mod network;
 pub mod placed_slot;
+pub mod placement;
 pub mod prefixes;
 pub mod relative;
 pub mod steps;

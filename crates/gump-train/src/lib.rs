@@ -33,6 +33,7 @@ pub mod loss;
 #[cfg(feature = "mpi")]
 mod mpi;
 mod perturbation;
+pub mod placement;
 mod process_group;
 pub mod relative;
 pub mod sample;

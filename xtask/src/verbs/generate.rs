@@ -79,6 +79,12 @@ pub(crate) struct Args {
     /// Placement of objects
     #[arg(long, value_parser = one_of(PLACEMENTS), default_value_t = Placement::Guided)]
     placement: Placement,
+    /// Draw the places of vehicles from the placement network: queues before red lights, usual gaps
+    #[arg(long)]
+    placement_network: bool,
+    /// With --placement-network: park vehicles beyond the edges of the road as well
+    #[arg(long, requires = "placement_network")]
+    parks_off_road: bool,
     /// Weights of the model [default: the shipped ones]
     #[arg(long, value_name = "FILE", value_parser = worlds::weights)]
     weights: Option<PathBuf>,
@@ -199,6 +205,8 @@ impl Args {
             temperature: self.temperature.unwrap_or(manner.temperature),
             top_k: self.top_k.map_or(manner.top_k, NonZeroUsize::get),
             placement: self.placement,
+            placement_network: self.placement_network,
+            parks_off_road: self.parks_off_road,
             // Agents that stand without a reason would still be there half a minute later.
             standing_has_reasons: self.simulate > 0.0 && !self.paper,
             ..manner

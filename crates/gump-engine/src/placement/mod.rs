@@ -2,6 +2,8 @@
 //! a scene.
 
 pub mod births;
+pub mod network;
 pub mod object_spec;
+pub mod places;
 pub mod rules;
 pub mod spawn_map;

@@ -4,15 +4,19 @@
 //! in its direction anywhere, a column if it has a valid cell. [`Rules::broken`] afterwards checks
 //! what masks cannot (the exact box).
 
-use std::sync::Arc;
+use std::f64::consts::PI;
+use std::sync::{Arc, OnceLock};
 
 use gump_geometry::{DVec2, OrientedBox, Pose, angle_difference, dvec2};
 use gump_metrics::metres_off_road;
 use gump_model::decoder::{Bins, STATE_STEPS, STEPS};
-use gump_scene::{AgentKind, MapGraph};
+use gump_scene::{AgentKind, MapGraph, Seed};
 use gump_tokenizer::{Field, QuantizedState};
+use rand::Rng as _;
 
+use crate::placement::network::PlacementScorer;
 use crate::placement::object_spec::{Bounds, ObjectSpec};
+use crate::placement::places::{CELL, NewVehicle, Place, PlaceKind, Places, Traffic};
 use crate::placement::spawn_map::{CELLS, Cell, Entry, SLOW, SpawnMap, goes};
 use crate::request::Guide;
 
@@ -28,6 +32,24 @@ const LANE_KEEPING: f64 = 0.03;
 /// An object this near to a lane's centre line is on it, metres: about the diagonal of a cell.
 /// Chosen by hand.
 const ON_LANE_M: f64 = 1.2;
+/// Range of a vehicle's deviation from the centre line of its lane, metres. Chosen by hand.
+const OFF_CENTRE: f64 = 0.5;
+/// Range of a parked vehicle's deviation from the direction of its place, radians. Chosen by hand.
+const ASKEW: f64 = 0.08;
+/// Divides the scores of places. At 1 vehicles gather in few queues; at 1.5 first frames are more
+/// like recorded ones in every measure but one (docs/results/0029-placement.md).
+const PLACE_TEMPERATURE: f64 = 1.5;
+/// Width of the columns in which places are drawn, metres: four times the distance of places on a
+/// lane, so that a column has more than one. Chosen by hand.
+const COLUMN: f64 = 4.0;
+/// Distance of the centres of vehicles that are parked side by side, and its range, metres. Chosen
+/// by hand.
+const BAY: f64 = 2.8;
+const BAY_RANGE: f64 = 0.3;
+/// Gap between vehicles parked end to end, and its range, metres. Chosen by hand.
+const KERB_GAP: f64 = 1.2;
+/// Share of the vehicles parked along a lane that face against it. Chosen by hand.
+const AGAINST: f64 = 0.1;
 /// A gap in a row is met to this, metres: half a step of the grid along each axis and some turn.
 const ROW_SLACK: f64 = 0.5;
 
@@ -52,6 +74,65 @@ pub struct Rules {
     pub is_guided: bool,
     /// Differences of its draws from those of a rollout.
     pub manner: Manner,
+    /// Its place is drawn from these, if they are there and one of them is valid, and not by the
+    /// sequence network.
+    pub places: Option<PlaceDraw>,
+}
+
+/// A draw by the placement network.
+#[derive(Clone, Debug)]
+pub struct PlaceDraw {
+    /// The network.
+    pub scorer: Arc<PlacementScorer>,
+    /// The places of the scene.
+    pub places: Arc<Places>,
+    /// The places that are worth a score without other vehicles, by their index.
+    pub likely: Arc<[bool]>,
+    /// The vehicles already placed.
+    pub traffic: Arc<Traffic>,
+    /// Whether vehicles may park beyond the edges of the road.
+    pub off_road: bool,
+    /// Decides the draw.
+    pub seed: Seed,
+    /// The place and pose drawn for the size and velocity that were asked for first.
+    drawn: OnceLock<Option<(Place, Pose)>>,
+}
+
+impl PlaceDraw {
+    /// A draw that is still to be made.
+    pub fn new(
+        scorer: Arc<PlacementScorer>,
+        (places, likely): (Arc<Places>, Arc<[bool]>),
+        traffic: Arc<Traffic>,
+        off_road: bool,
+        seed: Seed,
+    ) -> Self {
+        Self {
+            scorer,
+            places,
+            likely,
+            traffic,
+            off_road,
+            seed,
+            drawn: OnceLock::new(),
+        }
+    }
+
+    /// Another draw of the same.
+    pub fn again(&self, seed: Seed) -> Self {
+        Self {
+            seed,
+            drawn: OnceLock::new(),
+            ..self.clone()
+        }
+    }
+
+    /// Whether place `i` is considered: if it is likely, or near a vehicle that stands.
+    fn offers(&self, i: usize) -> bool {
+        let place = &self.places.all()[i];
+        (self.off_road || place.is_on_road())
+            && (self.likely[i] || self.traffic.stands_near(place.pose.position))
+    }
 }
 
 /// Adjustments to the draws of an object's fields.
@@ -91,6 +172,19 @@ impl Guide for Rules {
             bins.map(|bin| weight(field.dequantize(bin))).collect()
         };
         let bins = |open: &dyn Fn(f64) -> bool| weigh(&|value| f32::from(u8::from(open(value))));
+        if matches!(field, Field::X | Field::Y | Field::Heading) {
+            let size = dvec2(value(1), value(0));
+            if let Some(pose) = self.drawn_place(size, dvec2(value(2), value(3))) {
+                let drawn = match field {
+                    Field::X => pose.position.x,
+                    Field::Y => pose.position.y,
+                    _ => pose.heading,
+                };
+                let mut only = vec![0.0; field.n_bins()];
+                only[usize::from(field.quantize(drawn).bin)] = 1.0;
+                return Some(only);
+            }
+        }
         let half = field.step() / 2.0 + 1e-6;
         match field {
             Field::Width | Field::Length => {
@@ -199,7 +293,9 @@ impl Rules {
             let z = map.elevation_at(point).unwrap_or(0.0);
             metres_off_road(map, point, z).is_some_and(|metres| metres > 0.0)
         };
-        if self.kind == AgentKind::Vehicle && own.corners().into_iter().any(is_off) {
+        let may_be_off = self.places.as_ref().is_some_and(|draw| draw.off_road) && self.parks();
+        let must = self.kind == AgentKind::Vehicle && !may_be_off;
+        if must && own.corners().into_iter().any(is_off) {
             return Some("vehicles are on the road".into());
         }
         None
@@ -317,6 +413,128 @@ impl Rules {
         let turns = self.heading().is_some_and(|b| !b.admit_angle(way, 0.1));
         let goes = |ground: &Arc<SpawnMap>| ground.admits(velocity);
         !turns && (!self.rows.is_empty() || self.ground.as_ref().is_none_or(goes))
+    }
+
+    /// The pose that the placement network draws for a vehicle of this size and velocity; `None`
+    /// without it, and if no place is valid.
+    fn drawn_place(&self, size: DVec2, velocity: DVec2) -> Option<Pose> {
+        let draw = self.places.as_ref()?;
+        let drawn = draw
+            .drawn
+            .get_or_init(|| self.draw_place(draw, size, velocity));
+        drawn.map(|(_, pose)| pose)
+    }
+
+    /// True if it parks beside lanes, where road edges do not matter.
+    fn parks(&self) -> bool {
+        let draw = self.places.as_ref().and_then(|draw| draw.drawn.get());
+        draw.copied()
+            .flatten()
+            .is_some_and(|(place, _)| place.kind != PlaceKind::OnLane)
+    }
+
+    fn draw_place(&self, draw: &PlaceDraw, size: DVec2, velocity: DVec2) -> Option<(Place, Pose)> {
+        let own = NewVehicle {
+            velocity,
+            length: size.x,
+        };
+        let all = draw.places.all();
+        let valid = |i: &usize| {
+            let place = &all[*i];
+            own.suits(place) && draw.offers(*i) && self.admits_place(draw, place, size)
+        };
+        let which: Vec<usize> = (0..all.len()).filter(valid).collect();
+        let scores = draw
+            .scorer
+            .scores(&draw.places, &draw.traffic, &own, &which);
+        let peak = scores.iter().copied().reduce(f32::max)?;
+        let weight = |score: &f32| (f64::from(score - peak) / PLACE_TEMPERATURE).exp();
+        let weights: Vec<f64> = scores.iter().map(weight).collect();
+        let mut rng = draw.seed.rng();
+        let chosen = match self.manner.numbers {
+            Some(numbers) => {
+                let at = |k: usize| all[which[k]].pose.position;
+                choose_evenly(&weights, at, [numbers[4], numbers[5]])
+            }
+            None => choose(0..weights.len(), &weights, rng.random()),
+        };
+        let place = &all[which[chosen]];
+        let mut jitter = |scale: f64| (rng.random::<f64>() - 0.5) * scale;
+        if place.kind == PlaceKind::OnLane {
+            return Some((
+                *place,
+                place.pose * Pose::new(jitter(1.0), jitter(OFF_CENTRE), 0.0),
+            ));
+        }
+        let moved = place.pose * Pose::new(jitter(CELL), jitter(CELL), jitter(ASKEW));
+        let noise = [jitter(1.0), jitter(1.0)];
+        let mut pose = self.in_row(moved, size, noise).unwrap_or(moved);
+        let backwards = if place.kind == PlaceKind::Along {
+            AGAINST
+        } else {
+            0.5
+        };
+        if rng.random_bool(backwards) {
+            pose = pose * Pose::new(0.0, 0.0, PI);
+        }
+        Some((*place, pose))
+    }
+
+    /// The pose next to a parked vehicle, in a row with it, if one is near enough; two numbers in
+    /// [-0.5, 0.5) vary it.
+    fn in_row(&self, pose: Pose, size: DVec2, noise: [f64; 2]) -> Option<Pose> {
+        let near = self.taken.iter().filter_map(|other| {
+            let at = other.pose.inverse() * pose.position;
+            let turn = angle_difference(pose.heading, other.pose.heading);
+            if turn.cos().abs() < 0.9 {
+                return None;
+            }
+            let bays = BAY + noise[0] * BAY_RANGE;
+            let cars = (size.x + other.length) / 2.0 + KERB_GAP + noise[0] * KERB_GAP;
+            let local = if at.x.abs() < 2.0 && (1.5..4.0).contains(&at.y.abs()) {
+                dvec2(noise[1] * OFF_CENTRE, bays * at.y.signum())
+            } else if at.y.abs() < 1.5 && (4.0..cars + 2.5).contains(&at.x.abs()) {
+                dvec2(cars * at.x.signum(), noise[1] * OFF_CENTRE)
+            } else {
+                return None;
+            };
+            let flip = if turn.cos() < 0.0 { PI } else { 0.0 };
+            let local = Pose::new(local.x, local.y, flip);
+            Some((at.length(), other.pose * local))
+        });
+        near.min_by(|a, b| a.0.total_cmp(&b.0))
+            .map(|(_, pose)| pose)
+    }
+
+    /// Whether a vehicle of this size may be at a place: in its bounds and clear of others.
+    fn admits_place(&self, draw: &PlaceDraw, place: &Place, size: DVec2) -> bool {
+        let pose = place.pose;
+        let is_open = |bounds: Option<Bounds>, value: f64| {
+            bounds.is_none_or(|bounds| bounds.admit(value, 0.0))
+        };
+        if !is_open(self.spec.x, pose.position.x) || !is_open(self.spec.y, pose.position.y) {
+            return false;
+        }
+        let turned = self
+            .heading()
+            .is_some_and(|b| !b.admit_angle(pose.heading, 0.1));
+        let elsewhere = self
+            .spec
+            .lane()
+            .is_some_and(|lane| draw.places.lane(place) != Some(lane));
+        if turned || elsewhere {
+            return false;
+        }
+        let own = OrientedBox {
+            pose,
+            length: size.x + CLEARANCE,
+            width: size.y + CLEARANCE,
+        };
+        let reach = own.length + own.width;
+        !self.taken.iter().any(|other| {
+            let apart = other.pose.position.distance(pose.position);
+            2.0 * apart < reach + other.length + other.width && own.overlaps(other)
+        })
     }
 
     /// Returns weights for the bins of `field`, by where the centre may be on that axis given the
@@ -453,6 +671,36 @@ impl Rules {
     }
 }
 
+/// The first of some indices up to which they have more than this share of their weight.
+fn choose(indices: impl Iterator<Item = usize> + Clone, weights: &[f64], share: f64) -> usize {
+    let total: f64 = indices.clone().map(|k| weights[k]).sum();
+    let (mut left, mut last) = (share * total, 0);
+    for k in indices {
+        (left, last) = (left - weights[k], k);
+        if left < 0.0 {
+            break;
+        }
+    }
+    last
+}
+
+/// An index drawn by its weight: its column along x by the first number, its place in the column by
+/// the second. Numbers from different strata then spread over the scene.
+fn choose_evenly(weights: &[f64], at: impl Fn(usize) -> DVec2, numbers: [f64; 2]) -> usize {
+    let mut order: Vec<usize> = (0..weights.len()).collect();
+    let column = |k: usize| (at(k).x / COLUMN).floor();
+    order.sort_by(|a, b| {
+        let columns = column(*a).total_cmp(&column(*b));
+        columns.then(at(*a).y.total_cmp(&at(*b).y))
+    });
+    let first = choose(order.iter().copied(), weights, numbers[0]);
+    let same = order
+        .iter()
+        .copied()
+        .filter(|k| column(*k) == column(first));
+    choose(same, weights, numbers[1])
+}
+
 /// The state of an object's bins, for an object without a previous state, whose chunk is therefore
 /// expressed in the scene's frame.
 pub fn state_of(bins: &Bins) -> QuantizedState {
@@ -488,6 +736,7 @@ mod tests {
             comes_to: None,
             is_guided: false,
             manner: Manner::default(),
+            places: None,
         }
     }
 

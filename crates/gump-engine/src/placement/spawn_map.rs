@@ -251,7 +251,7 @@ pub(crate) fn goes(ways: &[f32], heading: f64, slack: f64) -> bool {
     ways.len() == 0 || ways.any(|way| angle_difference(f64::from(*way), heading).abs() <= slack)
 }
 
-fn is_near(lane: &Lane, centre: DVec2) -> bool {
+pub(crate) fn is_near(lane: &Lane, centre: DVec2) -> bool {
     let points = lane.centerline.points();
     let (mut low, mut high) = (points[0], points[0]);
     for point in points {

@@ -19,6 +19,11 @@ const TRIES: usize = 20;
 pub enum SceneSource {
     /// The model, with its own manner of drawing.
     Model(Placement),
+    /// The model, the placement network placing vehicles on the road, or beyond its edges as well.
+    Placed {
+        /// Beyond the edges of the road as well.
+        off_road: bool,
+    },
     /// The model, with the manner of drawing of the paper.
     Paper,
     /// Anywhere on lanes.
@@ -37,9 +42,11 @@ pub enum SceneSource {
 
 impl SceneSource {
     /// All sources, those of the model first.
-    pub const ALL: [Self; 9] = [
+    pub const ALL: [Self; 11] = [
         Self::Model(Placement::Guided),
         Self::Model(Placement::Free),
+        Self::Placed { off_road: false },
+        Self::Placed { off_road: true },
         Self::Paper,
         Self::Random,
         Self::Retrieval,
@@ -54,6 +61,8 @@ impl SceneSource {
         match self {
             Self::Model(Placement::Guided) => "model guided",
             Self::Model(Placement::Free) => "model free",
+            Self::Placed { off_road: false } => "model guided, placement network",
+            Self::Placed { off_road: true } => "the same, parks off road",
             Self::Paper => "model guided, paper's draws",
             Self::Random => "random along lanes",
             Self::Retrieval => "retrieval",
@@ -207,6 +216,16 @@ impl SceneMakers<'_> {
                 seed,
                 GenerateConfig {
                     placement,
+                    ..GenerateConfig::default()
+                },
+            ),
+            SceneSource::Placed { off_road } => self.generate(
+                &case.recorded,
+                n,
+                seed,
+                GenerateConfig {
+                    placement_network: true,
+                    parks_off_road: off_road,
                     ..GenerateConfig::default()
                 },
             ),

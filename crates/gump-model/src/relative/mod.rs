@@ -28,3 +28,4 @@ pub use self::sample::SampleConfig as RelativeSampleConfig;
 #[cfg(feature = "tensors")]
 pub use self::store::{config, header, is_relative, load, save};
 pub use self::weights::RelativeWeights;
+pub(crate) use self::weights::plain_numbers;

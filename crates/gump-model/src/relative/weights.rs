@@ -33,36 +33,16 @@ impl RelativeWeights {
                 .and_then(|entries| entries.get(key))
         };
         if entry("architecture").map(String::as_str) != Some("relative") {
-            return Err(WeightsError::OtherNetwork.into());
+            return Err(WeightsError::OtherNetwork {
+                expected: "relative",
+            }
+            .into());
         }
         let text = entry("config").ok_or(WeightsError::NoConfig)?;
         let config: RelativeConfig =
             serde_json::from_str(text).map_err(WeightsError::InvalidConfig)?;
         config.validate()?;
-        let file = SafeTensors::deserialize(bytes).map_err(WeightsError::Damaged)?;
-        let mut numbers = BTreeMap::new();
-        for (name, view) in file.tensors() {
-            if PREFIXES.iter().any(|prefix| name.starts_with(prefix)) {
-                continue;
-            }
-            let data = view.data();
-            let flat: Vec<f32> = match view.dtype() {
-                Dtype::F32 => data
-                    .as_chunks::<4>()
-                    .0
-                    .iter()
-                    .map(|b| f32::from_le_bytes(*b))
-                    .collect(),
-                Dtype::F16 => data
-                    .as_chunks::<2>()
-                    .0
-                    .iter()
-                    .map(|b| half::f16::from_le_bytes(*b).to_f32())
-                    .collect(),
-                found => return Err(WeightsError::TensorType { name, found }.into()),
-            };
-            numbers.insert(name, flat);
-        }
+        let numbers = plain_numbers(bytes)?;
         Ok(Self { config, numbers })
     }
 
@@ -110,4 +90,33 @@ impl RelativeWeights {
             found: vec![numbers.len()],
         })
     }
+}
+
+/// The tensors of a checkpoint by name, row-major f32, without those of a training run.
+pub(crate) fn plain_numbers(bytes: &[u8]) -> Result<BTreeMap<String, Vec<f32>>, ModelError> {
+    let file = SafeTensors::deserialize(bytes).map_err(WeightsError::Damaged)?;
+    let mut numbers = BTreeMap::new();
+    for (name, view) in file.tensors() {
+        if PREFIXES.iter().any(|prefix| name.starts_with(prefix)) {
+            continue;
+        }
+        let data = view.data();
+        let flat: Vec<f32> = match view.dtype() {
+            Dtype::F32 => data
+                .as_chunks::<4>()
+                .0
+                .iter()
+                .map(|b| f32::from_le_bytes(*b))
+                .collect(),
+            Dtype::F16 => data
+                .as_chunks::<2>()
+                .0
+                .iter()
+                .map(|b| half::f16::from_le_bytes(*b).to_f32())
+                .collect(),
+            found => return Err(WeightsError::TensorType { name, found }.into()),
+        };
+        numbers.insert(name, flat);
+    }
+    Ok(numbers)
 }

@@ -1,5 +1,6 @@
 //! `train`: a world model from scenarios, in one stage or several, by one process or several.
 
+mod placement;
 mod realism;
 mod relative;
 mod stages;
@@ -59,7 +60,8 @@ pub(crate) struct Args {
     #[arg(long, value_name = "FILE", conflicts_with = "resume")]
     from: Option<PathBuf>,
     /// The size of the model: tiny, small, base or medium; or `relative`, the network with relative
-    /// attention throughout [default: tiny]
+    /// attention throughout; or `placement`, which places the vehicles of generated scenes [default:
+    /// tiny]
     #[arg(long, value_name = "NAME")]
     model: Option<String>,
     /// Optimiser steps
@@ -102,6 +104,9 @@ fn was_trained_in(out: &Path) -> bool {
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         self.check(run)?;
+        if self.model.as_deref() == Some(placement::NAME) {
+            return together(|processes| placement::execute(self, run, processes));
+        }
         if relative::is_requested(self)? {
             return together(|processes| relative::execute(self, run, processes));
         }
@@ -118,7 +123,10 @@ impl Args {
     ///
     /// Error: [`WrongArguments`].
     fn check(&self, run: &Run) -> anyhow::Result<()> {
-        let known = ModelConfig::PRESETS.iter().copied().chain([relative::NAME]);
+        let known = ModelConfig::PRESETS
+            .iter()
+            .copied()
+            .chain([relative::NAME, placement::NAME]);
         let wrong = match (&self.model, self.steps) {
             (Some(name), _) if !known.clone().any(|known| known == name) => {
                 let known: Vec<&str> = known.collect();
