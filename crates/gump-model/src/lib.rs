@@ -4,7 +4,8 @@
 //! paper's: the scene as tokens and a raster, a causal transformer, and a decoder of states.
 //! [`config::ModelConfig`] describes its shape, `mct.rs` contains the transformer, and `decoder.rs`
 //! turns a hidden vector into a state. The relative network ([`relative`]) sees agents and pieces
-//! of map by their relative poses. `gump-engine` rolls the networks out, `gump-train` trains them.
+//! of map by their relative poses. A third, small one ([`placement`]) places the vehicles of
+//! generated scenes. `gump-engine` rolls the networks out, `gump-train` trains them.
 //!
 //! Without the feature `tensors` (on by default) the networks are left out and no tensor library is
 //! needed; inputs, outputs and weights as plain numbers ([`relative::RelativeWeights`]) remain.

@@ -2,7 +2,8 @@
 //!
 //! For the sequence network: samples ([`sample`]), losses ([`loss`]), closed-loop training
 //! ([`closed_loop_samples`]) and the trainer ([`Trainer`]). For the relative network: its own
-//! rollouts as training data, rewards, and the trainer ([`relative`]). Runs resume exactly, and the same seed
+//! rollouts as training data, rewards, and the trainer ([`relative`]). The network that places
+//! vehicles in generated scenes has its own ([`placement`]). Runs resume exactly, and the same seed
 //! gives the same result for any number of threads. The networks are in `gump-model`; command line,
 //! progress and output files are in `xtask`.
 //!

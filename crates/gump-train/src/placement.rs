@@ -479,6 +479,8 @@ fn place_of(places: &Places, which: &[usize], pose: Pose) -> Option<usize> {
 
 #[cfg(test)]
 mod tests {
+    use gump_engine::placement::network::PlacementScorer;
+    use gump_model::placement::PlacementWeights;
     use gump_scene::fixture;
 
     use super::*;
@@ -533,6 +535,23 @@ mod tests {
         assert_eq!(numbers(&whole), numbers(&resumed));
         let [loss, uniform] = whole.validate(&[scenario()]).unwrap();
         assert!(loss < uniform - 0.3, "{loss} of {uniform}");
+    }
+
+    #[test]
+    fn weights_with_other_properties_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("other.safetensors");
+        let other = PlacementConfig {
+            features: 3,
+            hidden: 4,
+        };
+        PlacementNetwork::random(other, Seed(0))
+            .unwrap()
+            .save(&path)
+            .unwrap();
+        let weights = PlacementWeights::read(&std::fs::read(&path).unwrap()).unwrap();
+        let error = PlacementScorer::new(&weights).unwrap_err().to_string();
+        assert!(error.contains("reads 3 properties of a place"), "{error}");
     }
 
     #[test]

@@ -172,6 +172,11 @@ impl Args {
                 "--simulate: expected a number from 0 to 3600, found {}",
                 self.simulate
             )
+        } else if self.placement_network && self.placement != Placement::Guided {
+            format!(
+                "--placement-network: expected --placement guided, found {}",
+                self.placement
+            )
         } else {
             return Ok(());
         };

@@ -10,11 +10,13 @@ mod beside;
 mod features;
 mod traffic;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use gump_geometry::{DVec2, Pose, angle_difference};
-use gump_scene::{LaneId, LaneKind, Light, LightState, MapGraph, lanes_ahead, stop_line};
+use gump_scene::{
+    LaneAhead, LaneId, LaneKind, Light, LightState, MapGraph, lanes_ahead, stop_line,
+};
 
 pub use self::beside::CELL;
 pub use self::features::N_FEATURES;
@@ -135,7 +137,7 @@ impl Places {
         });
         let lanes: Vec<_> = lanes.collect();
         let index: BTreeMap<LaneId, u32> = lanes.iter().map(|lane| lane.id).zip(0..).collect();
-        let stops: std::collections::BTreeSet<LaneId> = map
+        let stops: BTreeSet<LaneId> = map
             .stop_signs()
             .iter()
             .flat_map(|sign| sign.lanes.iter().copied())
@@ -154,7 +156,7 @@ impl Places {
                 let at = part.lane.centerline.project(line).arc_length;
                 Some((part.base_m + at, light.state))
             });
-            let first = |at: &dyn Fn(&gump_scene::LaneAhead<'_>) -> Option<f64>| {
+            let first = |at: &dyn Fn(&LaneAhead<'_>) -> Option<f64>| {
                 reached.iter().filter_map(at).fold(f64::INFINITY, f64::min)
             };
             Chain {

@@ -16,7 +16,6 @@ const STANDS: f64 = 0.5;
 /// A vehicle at this distance to the side is beside a place, metres: on the next lane or in the next
 /// bay.
 const BESIDE: [f64; 2] = [1.8, 5.5];
-
 /// Distance to the next vehicles of a row, metres: one ahead, two beside.
 const ROW: f64 = 8.0;
 
@@ -49,7 +48,6 @@ impl Traffic {
     /// These vehicles among the places of a scene.
     pub fn new(places: &Places, vehicles: Vec<PlacedVehicle>) -> Self {
         let mut on_lanes = vec![Vec::new(); places.chains.len()];
-        // Lanes from which a lane can be reached, with its start.
         for vehicle in &vehicles {
             let pose = places.world_from_scene * vehicle.outline.pose;
             for (lane, _) in places.map.lanes_near(pose.position, ON_LANE) {
