@@ -25,6 +25,8 @@ pub enum Measure {
     RedLight,
     /// A vehicle changes to an adjacent lane.
     LaneChange,
+    /// A vehicle leaves the road.
+    RoadExit,
     /// A standing vehicle starts.
     SetOff,
     /// An agent stands at a given time.
@@ -45,7 +47,7 @@ pub enum Measure {
 
 impl Measure {
     /// All, in the order of tables.
-    pub const ALL: [Self; 16] = [
+    pub const ALL: [Self; 17] = [
         Self::ParkedMove,
         Self::FreeRoadStop,
         Self::FreeRoadStanding,
@@ -54,6 +56,7 @@ impl Measure {
         Self::Slip,
         Self::RedLight,
         Self::LaneChange,
+        Self::RoadExit,
         Self::SetOff,
         Self::Standing,
         Self::ComeToRest,
@@ -75,6 +78,7 @@ impl Measure {
             Self::Slip => "slip",
             Self::RedLight => "red_light",
             Self::LaneChange => "lane_change",
+            Self::RoadExit => "road_exit",
             Self::SetOff => "set_off",
             Self::Standing => "standing",
             Self::ComeToRest => "come_to_rest",
@@ -95,7 +99,7 @@ impl Measure {
     pub fn per(self) -> &'static str {
         match self {
             Self::ParkedMove => "parked vehicle",
-            Self::FreeRoadStop | Self::LaneChange => "minute of moving",
+            Self::FreeRoadStop | Self::LaneChange | Self::RoadExit => "minute of moving",
             Self::FreeRoadStanding => "vehicle that moves",
             Self::NewOverlap | Self::Standing => "agent",
             Self::ComeToRest => "vehicle that moves slowly",

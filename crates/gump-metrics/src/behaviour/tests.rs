@@ -470,6 +470,45 @@ fn lane_changes_go_to_the_lane_beside() {
 }
 
 #[test]
+fn who_drives_over_the_edge_leaves_the_road_once() {
+    let border = "edge: -100,-4 500,-4\nedge: 500,4 -100,4\n";
+    let check = |map: &str, y: f64, aside: fn(f64) -> f64, expected: f64| {
+        let agent = format!("agent vehicle 1: 30,{y} velocity 5,0");
+        let scenario = scenario(&format!("{ROAD}{map}{agent}"));
+        let rollout = only(&scenario, 1, |pose, t| {
+            pose * Pose::new(5.0 * t, -aside(t), 0.0)
+        });
+        assert_eq!(events(&scenario, &rollout, Measure::RoadExit), expected);
+    };
+    check(border, 0.0, |_| 0.0, 0.0);
+    check(border, 0.0, |t| t, 1.0);
+    // On the kerb; and off the road, back to the kerb and off again.
+    check(border, 0.0, |t| t.min(4.4), 0.0);
+    let kerb = |t: f64| {
+        if (4.0..6.0).contains(&t) {
+            4.2
+        } else {
+            5.0 * t.min(1.0)
+        }
+    };
+    check(border, 0.0, kerb, 1.0);
+    // Off the road, back on it and off again.
+    let back = |t: f64| {
+        if (4.0..6.0).contains(&t) {
+            3.0
+        } else {
+            5.0 * t.min(1.0)
+        }
+    };
+    check(border, 0.0, back, 2.0);
+    // Past the end of the map, and on a map without a border.
+    check("edge: -100,-4 40,-4\nedge: 40,4 -100,4\n", 0.0, |t| t, 0.0);
+    check("", 0.0, |t| t, 0.0);
+    // Who is off the road from the start has not left it.
+    check(border, -6.0, |_| 0.0, 0.0);
+}
+
+#[test]
 fn who_sets_off_and_who_stands() {
     let scenario = scenario("ego vehicle 0: 0,0\nagent pedestrian 1: 9,9 velocity 1.5,0");
     let rollout = only(&scenario, 0, |pose, t| {
