@@ -30,6 +30,7 @@
 //! ```
 
 mod agent;
+mod bends;
 mod ego_state;
 pub mod fixture;
 mod frame;
@@ -46,6 +47,7 @@ mod stop_line;
 mod tag;
 
 pub use agent::{Agent, AgentId, AgentKind, AgentState};
+pub use bends::{BendLimits, bend_speed};
 pub use ego_state::{EgoState, VehicleParameters};
 pub use frame::{Frame, Light, LightState};
 pub use gump_seed::{Rng, Seed, standard_normal};

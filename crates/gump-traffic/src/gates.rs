@@ -11,8 +11,8 @@ use std::collections::BTreeMap;
 
 use gump_geometry::{DVec2, Polyline, Pose, dvec2};
 use gump_scene::{
-    Agent, AgentId, AgentKind, AgentState, Frame, Lane, LaneId, LaneKind, MapGraph, Rng,
-    SceneState, Seed, TYPICAL_SPEED_LIMIT,
+    Agent, AgentId, AgentKind, AgentState, BendLimits, Frame, Lane, LaneId, LaneKind, Light,
+    LightState, MapGraph, Rng, SceneState, Seed, TYPICAL_SPEED_LIMIT, bend_speed, lanes_ahead,
 };
 use rand::Rng as _;
 
@@ -76,6 +76,15 @@ const PLATOON_LIMIT: f64 = 8.0;
 const PERIOD_S: (f64, f64) = (40.0, 80.0);
 const OPEN: f64 = 0.5;
 
+/// What an entering driver accepts in bends and before them, gently.
+const BENDS: BendLimits = BendLimits {
+    lateral_mps2: 2.5,
+    braking_mps2: 1.5,
+    ahead_m: 80.0,
+};
+/// Distance at which an entering driver stops before a red light, metres.
+const STOP_M: f64 = 3.0;
+
 /// A place where agents enter.
 #[derive(Clone, Debug)]
 struct Gate {
@@ -87,6 +96,8 @@ struct Gate {
     /// The path beyond it.
     path: Polyline,
     limit: f64,
+    /// The greatest speed for the bends beyond it, metres per second.
+    bends: f64,
 }
 
 /// Arrivals and departures of one future.
@@ -222,7 +233,10 @@ impl Flow {
             if self.gates[g].pose.position.distance(centre) < self.config.sight_m {
                 continue;
             }
-            if let Some(agent) = self.at_gate(g, map, &there, &counts, dt, &mut seed.rng()) {
+            let lights = frame.lights();
+            if let Some(agent) =
+                self.at_gate(g, map, (&there, lights), &counts, dt, &mut seed.rng())
+            {
                 there.push(agent);
                 come.push(agent);
             }
@@ -250,7 +264,7 @@ impl Flow {
         &mut self,
         g: usize,
         map: &MapGraph,
-        there: &[Agent],
+        (there, lights): (&[Agent], &[Light]),
         counts: &[[f64; 3]],
         dt: f64,
         rng: &mut Rng,
@@ -284,7 +298,10 @@ impl Flow {
         };
         // Drivers keep to the limit, about, and people differ by a fifth; chosen by hand.
         let wanted = match KINDS[k] {
-            AgentKind::Vehicle => gate.limit * rng.random_range(0.8..1.05),
+            AgentKind::Vehicle => {
+                let wanted = gate.limit * rng.random_range(0.8..1.05);
+                wanted.min(gate.bends).min(before_red(map, gate, lights))
+            }
             _ => USUAL_SPEED[k] * rng.random_range(0.8..1.2),
         };
         let speed = entering_speed(gate, there, size[0], wanted)?;
@@ -342,6 +359,25 @@ fn ends_at(map: &MapGraph, agent: &Agent) -> bool {
         let foot = lane.centerline.project(pose.position);
         let left = lane.centerline.length() - foot.arc_length - agent.length / 2.0;
         left < END_M && map.successors(lane.id).next().is_none()
+    })
+}
+
+/// The speed from which gentle braking is enough for the red lights beyond a gate, metres per
+/// second.
+fn before_red(map: &MapGraph, gate: &Gate, lights: &[Light]) -> f64 {
+    let Some(lane) = map.lane(gate.lane) else {
+        return f64::INFINITY;
+    };
+    let at = lane.centerline.project(gate.pose.position).arc_length;
+    let (ahead, _) = lanes_ahead(map, lane, at, PATH_M);
+    let red = lights.iter().filter(|l| l.state == LightState::Red);
+    let stops = red.flat_map(|light| {
+        let its = ahead.iter().filter(|part| part.lane.id == light.lane);
+        its.map(|part| part.metres_to_stop_line(light))
+    });
+    let least = stops.filter(|metres| *metres > 0.0).reduce(f64::min);
+    least.map_or(f64::INFINITY, |metres| {
+        (2.0 * BENDS.braking_mps2 * (metres - STOP_M).max(0.0)).sqrt()
     })
 }
 
@@ -417,6 +453,7 @@ fn gates(map: &MapGraph, centres: &[DVec2], ego: DVec2, config: &Arrivals) -> Ve
                 continue;
             };
             let limit = lane.speed_limit.unwrap_or(TYPICAL_SPEED_LIMIT);
+            let bends = bend_speed(map, lane, s, BENDS);
             let gate = |kind: usize, pose: Pose| Gate {
                 kind,
                 window,
@@ -424,6 +461,7 @@ fn gates(map: &MapGraph, centres: &[DVec2], ego: DVec2, config: &Arrivals) -> Ve
                 pose,
                 path: path.clone(),
                 limit,
+                bends,
             };
             if !is_for_bicycles {
                 gates.push(gate(0, pose));
@@ -459,6 +497,7 @@ fn gates(map: &MapGraph, centres: &[DVec2], ego: DVec2, config: &Arrivals) -> Ve
                     pose,
                     path,
                     limit: TYPICAL_SPEED_LIMIT,
+                    bends: f64::INFINITY,
                 });
             }
         }

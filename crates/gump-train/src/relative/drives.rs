@@ -11,10 +11,8 @@
 //! The resulting motion is the target, so that the network learns to follow the rules itself. Its
 //! own draws do not say how often parked vehicles start, nor how often somebody starts at red, so
 //! these stay where the log has them. Nor do they say where vehicles slow down: rules prefer slow
-//! draws, which the network would learn from everywhere, so vehicles that have nothing to slow down
-//! for are drawn again if they do.
-
-use std::f64::consts::FRAC_PI_6;
+//! draws, which the network would learn from everywhere. Nor that no way out is left to a vehicle
+//! that comes to a bend too fast. So moves with such faults are drawn again (`faults`).
 
 use gump_engine::relative::engine::{Draw, RelativeEngine, Workspace};
 use gump_engine::relative::rules::resolve;
@@ -27,13 +25,13 @@ use gump_model::relative::grid::dequantize;
 use gump_model::relative::map::VectorMap;
 use gump_model::relative::sample::{Track, TrackDriver};
 use gump_model::relative::{RelativeNetwork, RelativeWeights};
-use gump_model::steps::TOKEN_DT;
-use gump_scene::{AgentKind, LaneAhead, LightState, MapGraph, Seed, lanes_ahead};
+use gump_scene::{AgentKind, LightState, MapGraph, Seed};
 use rand::Rng as _;
 use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
 use crate::relative::crowd::Crowd;
+use crate::relative::faults::Road;
 
 /// Frames that are shown as logged before the network drives: one move, so that it has seen agents
 /// move.
@@ -53,24 +51,14 @@ const WAITS_M: f64 = 0.2;
 /// chosen by hand.
 const RED_AHEAD_M: f64 = 60.0;
 const RED_ASIDE_M: f64 = 6.0;
-/// A vehicle slows down if it loses more than this in a step of half a second, metres per second, ...
-const SLOWS_MPS: f64 = 0.4;
-/// ... on a straight path: if it turns no more than this in the step, radians, ...
-const STRAIGHT: f64 = 0.06;
-/// ... for no reason if it is on a lane, with its centre within this distance and heading along it
-/// within this angle, ...
-const IN_LANE_M: f64 = 1.0;
-const IN_LANE: f64 = FRAC_PI_6;
-/// ... that goes on for this distance without a junction or a stop sign, metres (and sees nothing
-/// else: `View::is_free`). It is drawn again so many times. All were chosen by hand.
-const FREE_M: f64 = 35.0;
-const SLOW_REDRAWS: usize = 4;
+/// A move with a fault is drawn again so many times. Chosen by hand.
+const FAULT_REDRAWS: usize = 4;
 /// Radius around a sample in which road edges are considered, metres. Chosen by hand.
 const EDGES_M: f64 = 150.0;
 /// Separates the choice of how a sample is driven from its draws.
 const RULED: u64 = 1 << 32;
-/// Separates redraws of vehicles that slow down from those of the rules.
-const SLOW: usize = 1 << 16;
+/// Separates redraws of moves with faults from those of the rules.
+const FAULT: usize = 1 << 16;
 /// Separates agents that are added to a sample from its draws.
 const CROWD: u64 = 1 << 33;
 
@@ -249,11 +237,12 @@ impl TrackDriver for NetworkDriver {
                 let stay = here.iter().zip(&agents);
                 let stay: Vec<bool> = stay.map(|one| stays[*one.0] || waits(one)).collect();
                 let crowd = (&agents[..], &stay[..]);
-                let is_free = |i: usize| {
-                    look(map, lights, &agents, i).is_free(&agents[i])
-                        && goes_on(streets, agents[i].pose)
-                };
-                let ground = (lane_map, &is_free as &dyn Fn(usize) -> bool);
+                let is_free = |i: usize| look(map, lights, &agents, i).is_free(&agents[i]);
+                let roads: Vec<Road<'_>> = (agents.iter().zip(&stay))
+                    .map(|(now, stay)| Road::ahead_of(now, *stay, streets))
+                    .collect();
+                let fault = |i: usize, step: &Pose| roads[i].fault(&agents[i], step, || is_free(i));
+                let ground = (lane_map, &fault as &dyn Fn(usize, &Pose) -> f64);
                 let moves = self.moves_by_the_rules(crowd, ground, &hidden, seed, &mut room);
                 for ((&a, now), step) in here.iter().zip(&agents).zip(moves) {
                     if let Some(next) = tracks[a].states[t + 1].as_mut().filter(|_| !stays[a]) {
@@ -283,12 +272,12 @@ impl TrackDriver for NetworkDriver {
 }
 
 impl NetworkDriver {
-    /// A move of every agent in its own frame, redrawn where it slows down on a free road and where
-    /// the rules forbid it; marked agents stay.
+    /// A move of every agent in its own frame, redrawn where it has a fault and where the rules
+    /// forbid it; marked agents stay.
     fn moves_by_the_rules(
         &self,
         (agents, stay): (&[Shown], &[bool]),
-        (lane_map, is_free): (&LaneMap, &dyn Fn(usize) -> bool),
+        (lane_map, fault): (&LaneMap, &dyn Fn(usize, &Pose) -> f64),
         hidden: &[f32],
         seed: Seed,
         room: &mut Workspace,
@@ -315,22 +304,17 @@ impl NetworkDriver {
         };
         let all: Vec<usize> = (0..agents.len()).collect();
         let mut moves = drawn(&all, 0);
-        let lost = |i: usize, step: &Pose| lost_speed(&agents[i], step);
-        let slow = |i: &usize| {
-            let is_vehicle = agents[*i].body.kind == AgentKind::Vehicle && !stay[*i];
-            is_vehicle && lost(*i, &moves[*i]).is_some_and(|lost| lost > SLOWS_MPS) && is_free(*i)
-        };
-        let slow: Vec<usize> = all.iter().copied().filter(slow).collect();
-        for attempt in 0..SLOW_REDRAWS {
-            let still = slow.iter().copied();
-            let still: Vec<usize> = still
-                .filter(|&i| lost(i, &moves[i]).is_some_and(|lost| lost > SLOWS_MPS))
-                .collect();
-            for (&i, step) in still.iter().zip(drawn(&still, SLOW + attempt)) {
-                if step.position.x > moves[i].position.x {
-                    moves[i] = step;
+        let faults = all.iter().map(|&i| (i, fault(i, &moves[i])));
+        let mut faulty: Vec<(usize, f64)> = faults.filter(|(_, fault)| *fault > 0.0).collect();
+        for attempt in 0..FAULT_REDRAWS {
+            let who: Vec<usize> = faulty.iter().map(|(i, _)| *i).collect();
+            for ((i, least), step) in faulty.iter_mut().zip(drawn(&who, FAULT + attempt)) {
+                let found = fault(*i, &step);
+                if found < *least {
+                    (moves[*i], *least) = (step, found);
                 }
             }
+            faulty.retain(|(_, least)| *least > 0.0);
         }
         let mut again = |who: &[usize], attempt: usize| drawn(who, attempt + 1);
         let redraws = self.config.redraws;
@@ -364,38 +348,6 @@ fn is_parked(track: &Track, streets: &MapGraph) -> bool {
     track.body.kind == AgentKind::Vehicle
         && logged.all(|pose| pose.position.distance(place) < PARKED_M)
         && streets.lanes_near(place, OFF_LANE_M).next().is_none()
-}
-
-/// Speed that a vehicle loses by a move, metres per second; `None` where it turns, for which drivers
-/// slow down.
-fn lost_speed(now: &Shown, step: &Pose) -> Option<f64> {
-    let speed = step.position.length() / TOKEN_DT;
-    (step.heading.abs() <= STRAIGHT).then(|| now.velocity().length() - speed)
-}
-
-/// Whether a vehicle is on a lane that goes on without a junction or a stop sign.
-pub(super) fn goes_on(streets: &MapGraph, pose: Pose) -> bool {
-    let lanes = streets.lanes_near(pose.position, IN_LANE_M);
-    let on = lanes.filter_map(|(lane, distance)| {
-        let at = lane.centerline.project(pose.position).arc_length;
-        let way = lane.centerline.pose_at(at).heading;
-        (angle_difference(way, pose.heading).abs() <= IN_LANE).then_some((lane, at, distance))
-    });
-    let Some((lane, at, _)) = on.min_by(|a, b| a.2.total_cmp(&b.2)) else {
-        return false;
-    };
-    let (ahead, goes_on) = lanes_ahead(streets, lane, at, FREE_M);
-    let stops = |id| {
-        streets
-            .stop_signs()
-            .iter()
-            .any(|sign| sign.lanes.contains(&id))
-    };
-    let is_open = |part: &LaneAhead<'_>| {
-        let is_junction = part.lane.in_intersection && part.lane.id != lane.id;
-        !is_junction && !stops(part.lane.id)
-    };
-    goes_on && ahead.iter().all(is_open)
 }
 
 /// Where lanes at red start.

@@ -2,6 +2,7 @@
 
 mod crowd;
 mod drives;
+mod faults;
 mod rewards;
 #[cfg(test)]
 mod tests;

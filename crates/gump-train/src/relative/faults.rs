@@ -1,0 +1,214 @@
+//! Moves that no driver would make, as far as the rules of traffic do not forbid them.
+//!
+//! In drives under the rules the network's own motion is its target. What is judged here is the
+//! speed: rules prefer slow draws, so that vehicles would slow down on free roads, more with each
+//! update; and a vehicle that comes to a bend too fast leaves the road whatever is drawn then.
+
+use std::cell::OnceCell;
+use std::f64::consts::FRAC_PI_6;
+
+use gump_geometry::{Pose, angle_difference};
+use gump_model::relative::graph::Shown;
+use gump_model::steps::TOKEN_DT;
+use gump_scene::{AgentKind, BendLimits, Lane, LaneAhead, MapGraph, bend_speed, lanes_ahead};
+
+// All were chosen by hand.
+
+/// A vehicle slows down if it loses more than this in a step of half a second, metres per second, ...
+const SLOWS_MPS: f64 = 0.4;
+/// ... on a straight path: if it turns no more than this in the step, radians, ...
+const STRAIGHT: f64 = 0.06;
+/// ... for no reason if it is on a lane, with its centre within this distance and heading along it
+/// within this angle, ...
+const IN_LANE_M: f64 = 1.0;
+const IN_LANE: f64 = FRAC_PI_6;
+/// ... that goes on for this distance without a junction or a stop sign, metres, sees nothing else
+/// (`View::is_free`), and is not faster than drivers like to be before a bend.
+const FREE_M: f64 = 35.0;
+const EASY: BendLimits = BendLimits {
+    lateral_mps2: 2.5,
+    braking_mps2: 1.5,
+    ahead_m: 80.0,
+};
+/// What hardly a driver exceeds. A vehicle that is faster than this allows loses ...
+const HARD: BendLimits = BendLimits {
+    lateral_mps2: 4.0,
+    braking_mps2: 3.0,
+    ahead_m: 60.0,
+};
+/// ... at least this in a step, metres per second.
+const BRAKES_MPS: f64 = 1.0;
+/// Most that a vehicle gains in a step, that it loses, and its greatest lateral acceleration times
+/// the duration of a step, metres per second: 4, 8 and 5 m/s².
+const GAINS_MPS: f64 = 2.0;
+const LOSES_MPS: f64 = 4.0;
+const SIDEWAYS_MPS: f64 = 2.5;
+/// Slower vehicles can take any bend, metres per second.
+const SLOW_MPS: f64 = 4.0;
+
+/// The road ahead of a vehicle.
+pub(super) struct Road<'a> {
+    streets: &'a MapGraph,
+    /// The lane that it is on, and its distance from the start, metres.
+    on: Option<(&'a Lane, f64)>,
+    /// Greatest speed for the bends ahead, metres per second.
+    most: f64,
+    /// Whether it has nothing to slow down for; determined when it is asked for.
+    is_free: OnceCell<bool>,
+    /// Whether it is judged at all.
+    drives: bool,
+}
+
+impl<'a> Road<'a> {
+    /// Of an agent; those that stay where they are, and who is not a vehicle, have no faults.
+    pub(super) fn ahead_of(now: &Shown, stays: bool, streets: &'a MapGraph) -> Self {
+        let drives = now.body.kind == AgentKind::Vehicle && !stays;
+        let on = drives.then(|| lane_under(streets, now.pose)).flatten();
+        let bends = on.filter(|_| now.velocity().length() > SLOW_MPS);
+        Self {
+            streets,
+            on,
+            most: bends.map_or(f64::INFINITY, |(lane, at)| {
+                bend_speed(streets, lane, at, HARD)
+            }),
+            is_free: OnceCell::new(),
+            drives,
+        }
+    }
+
+    /// By how much a move is beyond what drivers do, metres per second; 0 for one that they make.
+    ///
+    /// `sees_nothing` says whether the vehicle sees nothing to slow down for.
+    pub(super) fn fault(
+        &self,
+        now: &Shown,
+        step: &Pose,
+        sees_nothing: impl FnOnce() -> bool,
+    ) -> f64 {
+        if !self.drives {
+            return 0.0;
+        }
+        let speed = now.velocity().length();
+        let next = step.position.length() / TOKEN_DT;
+        let lost = speed - next;
+        let turn = step.heading.abs();
+        let body = (-lost - GAINS_MPS).max(0.0)
+            + (lost - LOSES_MPS).max(0.0)
+            + (next * turn - SIDEWAYS_MPS).max(0.0);
+        let bend = (next - self.most).min(BRAKES_MPS - lost).max(0.0);
+        let is_free = || {
+            let of_road = || self.on.is_some_and(|on| goes_on(self.streets, on, speed));
+            *self.is_free.get_or_init(|| sees_nothing() && of_road())
+        };
+        let slow = match lost > SLOWS_MPS && turn <= STRAIGHT && is_free() {
+            true => lost - SLOWS_MPS,
+            false => 0.0,
+        };
+        body + bend + slow
+    }
+}
+
+/// The lane that a vehicle is on, and its distance from the start, metres.
+fn lane_under(streets: &MapGraph, pose: Pose) -> Option<(&Lane, f64)> {
+    let lanes = streets.lanes_near(pose.position, IN_LANE_M);
+    let on = lanes.filter_map(|(lane, distance)| {
+        let at = lane.centerline.project(pose.position).arc_length;
+        let way = lane.centerline.pose_at(at).heading;
+        (angle_difference(way, pose.heading).abs() <= IN_LANE).then_some((lane, at, distance))
+    });
+    let (lane, at, _) = on.min_by(|a, b| a.2.total_cmp(&b.2))?;
+    Some((lane, at))
+}
+
+/// Whether a lane goes on from here without a junction, a stop sign or a bend that drivers at this
+/// speed slow down for.
+fn goes_on(streets: &MapGraph, (lane, at): (&Lane, f64), speed: f64) -> bool {
+    let (ahead, goes_on) = lanes_ahead(streets, lane, at, FREE_M);
+    let stops = |id| {
+        streets
+            .stop_signs()
+            .iter()
+            .any(|sign| sign.lanes.contains(&id))
+    };
+    let is_open = |part: &LaneAhead<'_>| {
+        let is_junction = part.lane.in_intersection && part.lane.id != lane.id;
+        !is_junction && !stops(part.lane.id)
+    };
+    goes_on && ahead.iter().all(is_open) && speed < bend_speed(streets, lane, at, EASY)
+}
+
+#[cfg(test)]
+mod tests {
+    use gump_geometry::dvec2;
+    use gump_model::relative::graph::Body;
+    use gump_scene::fixture;
+
+    use super::*;
+
+    fn streets(text: &str) -> MapGraph {
+        let scenario = fixture::scenario(&format!("{text}\nego vehicle 0: 5,0")).unwrap();
+        MapGraph::new(scenario.map.parts().clone()).unwrap()
+    }
+
+    /// The fault of a vehicle at `x` on the lane along x that drives at `speed` and then at `next`
+    /// m/s, turning by so many radians.
+    fn fault(streets: &MapGraph, x: f64, (speed, next): (f64, f64), turn: f64) -> f64 {
+        let body = Body {
+            kind: AgentKind::Vehicle,
+            length: 4.5,
+            width: 1.9,
+            sized: true,
+        };
+        let now = Shown::first(body, Pose::new(x, 0.0, 0.0), dvec2(speed, 0.0));
+        let step = Pose::new(next * TOKEN_DT, 0.0, turn);
+        Road::ahead_of(&now, false, streets).fault(&now, &step, || true)
+    }
+
+    #[test]
+    fn slowing_down_on_a_free_road_is_a_fault_and_at_a_junction_is_none() {
+        let mut parts =
+            streets("lane 1: 0,0 60,0 next 2\nlane 2: 60,0 90,0 next 3\nlane 3: 90,0 200,0")
+                .parts()
+                .clone();
+        parts.lanes[1].in_intersection = true;
+        let map = MapGraph::new(parts).unwrap();
+        let loses = |x: f64| fault(&map, x, (10.0, 9.0), 0.0);
+        assert!((loses(10.0) - 0.6).abs() < 1e-9, "{}", loses(10.0));
+        // In the junction and beyond it the road is free again; before it and before its end not.
+        assert!(loses(70.0) > 0.0 && loses(100.0) > 0.0);
+        assert!(loses(40.0) == 0.0 && loses(180.0) == 0.0);
+        // Less, or in a turn.
+        assert_eq!(fault(&map, 10.0, (10.0, 9.7), 0.0), 0.0);
+        assert_eq!(fault(&map, 10.0, (10.0, 9.0), 0.1), 0.0);
+    }
+
+    #[test]
+    fn off_the_lane_or_across_it_nothing_is_free() {
+        let map = streets("lane 1: 0,0 200,0");
+        assert!(lane_under(&map, Pose::new(10.0, 0.5, 0.1)).is_some());
+        assert!(lane_under(&map, Pose::new(10.0, 1.5, 0.0)).is_none());
+        assert!(lane_under(&map, Pose::new(10.0, 0.0, 1.0)).is_none());
+    }
+
+    #[test]
+    fn before_a_bend_who_is_fast_slows_down() {
+        // A right angle after 60 m.
+        let map = streets("lane 1: 0,0 60,0 60,80");
+        let at = |x: f64, speeds: (f64, f64)| fault(&map, x, speeds, 0.0);
+        assert!(at(40.0, (14.0, 14.0)) > 0.9 && at(40.0, (14.0, 13.5)) > 0.4);
+        assert_eq!(at(40.0, (14.0, 12.9)), 0.0);
+        // Far enough away, or slow enough; and slowing down early is none either.
+        assert!(at(10.0, (14.0, 14.0)) == 0.0 && at(40.0, (8.0, 8.0)) == 0.0);
+        assert_eq!(at(20.0, (14.0, 13.0)), 0.0);
+    }
+
+    #[test]
+    fn no_one_jumps() {
+        let map = streets("lane 1: 0,0 200,0");
+        let at = |speeds, turn| fault(&map, 180.0, speeds, turn);
+        assert!(at((8.0, 11.0), 0.0) > 0.9 && at((8.0, 9.9), 0.0) == 0.0);
+        assert!(at((10.0, 5.0), 0.0) > 0.9 && at((10.0, 6.5), 0.0) == 0.0);
+        // 3.6 and 6 m/s² sideways.
+        assert!(at((12.0, 12.0), 0.15) == 0.0 && at((12.0, 12.0), 0.25) > 0.4);
+    }
+}
