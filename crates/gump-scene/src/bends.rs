@@ -1,4 +1,4 @@
-//! Speeds at which vehicles can take the bends ahead.
+//! Speeds at which vehicles can take the bends ahead, and stop for what stops them.
 
 use gump_geometry::{DVec2, angle_difference};
 
@@ -39,6 +39,20 @@ pub struct BendLimits {
 /// assert!(speed(60.0).is_infinite());
 /// ```
 pub fn bend_speed(map: &MapGraph, lane: &Lane, arc_m: f64, limits: BendLimits) -> f64 {
+    approach_speed(map, lane, arc_m, limits, &|_, _| f64::INFINITY)
+}
+
+/// As [`bend_speed`], for ways on which some lanes limit the speed too.
+///
+/// `entering` gets a lane that a way leads into and the distance to its start, metres, and returns the
+/// greatest speed that the vehicle may have now, metres per second; infinite for a lane that is open.
+pub fn approach_speed(
+    map: &MapGraph,
+    lane: &Lane,
+    arc_m: f64,
+    limits: BendLimits,
+    entering: &dyn Fn(&Lane, f64) -> f64,
+) -> f64 {
     let start = lane.centerline.pose_at(arc_m);
     let way = Way {
         from: start.position,
@@ -46,7 +60,12 @@ pub fn bend_speed(map: &MapGraph, lane: &Lane, arc_m: f64, limits: BendLimits) -
         turns_over_m: STEP_M / 2.0,
         driven_m: 0.0,
     };
-    walk(map, lane, arc_m + STEP_M, way, limits, LANES)
+    let rules = Rules {
+        map,
+        limits,
+        entering,
+    };
+    rules.walk(lane, arc_m + STEP_M, way, LANES)
 }
 
 /// The way up to its last point.
@@ -61,39 +80,46 @@ struct Way {
     driven_m: f64,
 }
 
-/// The speed for the bends from the end of `way` on; its next point is `at` metres along `lane`.
-fn walk(
-    map: &MapGraph,
-    lane: &Lane,
-    mut at: f64,
-    mut way: Way,
+/// What limits the speed.
+struct Rules<'a> {
+    map: &'a MapGraph,
     limits: BendLimits,
-    left: usize,
-) -> f64 {
-    let mut least = f64::INFINITY;
-    while at <= lane.centerline.length() {
-        if way.driven_m > limits.ahead_m {
-            return least;
+    entering: &'a dyn Fn(&Lane, f64) -> f64,
+}
+
+impl Rules<'_> {
+    /// The speed for what is beyond the end of `way`, whose next point is `at` metres along `lane`.
+    fn walk(&self, lane: &Lane, mut at: f64, mut way: Way, left: usize) -> f64 {
+        let limits = self.limits;
+        let mut least = f64::INFINITY;
+        let length = lane.centerline.length();
+        while at <= length {
+            if way.driven_m > limits.ahead_m {
+                return least;
+            }
+            let point = lane.centerline.pose_at(at).position;
+            let heading = (point - way.from).to_angle();
+            let turn = angle_difference(heading, way.heading).abs();
+            let squared = limits.lateral_mps2 * way.turns_over_m / turn.max(1e-9);
+            least = least.min((squared + 2.0 * limits.braking_mps2 * way.driven_m).sqrt());
+            way = Way {
+                from: point,
+                heading,
+                turns_over_m: STEP_M,
+                driven_m: way.driven_m + STEP_M,
+            };
+            at += STEP_M;
         }
-        let point = lane.centerline.pose_at(at).position;
-        let heading = (point - way.from).to_angle();
-        let turn = angle_difference(heading, way.heading).abs();
-        let squared = limits.lateral_mps2 * way.turns_over_m / turn.max(1e-9);
-        least = least.min((squared + 2.0 * limits.braking_mps2 * way.driven_m).sqrt());
-        way = Way {
-            from: point,
-            heading,
-            turns_over_m: STEP_M,
-            driven_m: way.driven_m + STEP_M,
-        };
-        at += STEP_M;
+        let end_m = way.driven_m + length - (at - STEP_M);
+        let next = self.map.successors(lane.id).filter(|_| left > 0);
+        let best = next
+            .map(|next| {
+                let beyond = self.walk(next, at - length, way, left - 1);
+                beyond.min((self.entering)(next, end_m))
+            })
+            .reduce(f64::max);
+        best.map_or(least, |best| least.min(best))
     }
-    let over = at - lane.centerline.length();
-    let next = map.successors(lane.id).filter(|_| left > 0);
-    let best = next
-        .map(|next| walk(map, next, over, way, limits, left - 1))
-        .reduce(f64::max);
-    best.map_or(least, |best| least.min(best))
 }
 
 #[cfg(test)]
@@ -142,6 +168,23 @@ mod tests {
         assert!(speed(fork, 10.0) > 100.0);
         let turns = "lane 1: 0,0 30,0 next 2,3\nlane 2: 30,0 30,40\nlane 3: 30,0 30,-40";
         assert!(speed(turns, 10.0) < 10.0);
+    }
+
+    #[test]
+    fn a_closed_lane_counts_at_its_start_unless_another_is_open() {
+        let fork = "lane 1: 0,0 30,0 next 2,3\nlane 2: 30,0 80,0\nlane 3: 30,0 80,0.5";
+        let scenario = fixture::scenario(&format!("{fork}\nego vehicle 0: 0,0")).unwrap();
+        let map = &scenario.map;
+        let lane = map.lane(LaneId(1)).unwrap();
+        let speed = |closed: &[i64]| {
+            let entering = |lane: &Lane, metres: f64| match closed.contains(&lane.id.0) {
+                true => metres,
+                false => f64::INFINITY,
+            };
+            approach_speed(map, lane, 13.0, LIMITS, &entering)
+        };
+        assert!((speed(&[2, 3]) - 17.0).abs() < 1e-9, "{}", speed(&[2, 3]));
+        assert!(speed(&[2]) > 20.0 && speed(&[3]) > 100.0);
     }
 
     #[test]

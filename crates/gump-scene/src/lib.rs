@@ -47,7 +47,7 @@ mod stop_line;
 mod tag;
 
 pub use agent::{Agent, AgentId, AgentKind, AgentState};
-pub use bends::{BendLimits, bend_speed};
+pub use bends::{BendLimits, approach_speed, bend_speed};
 pub use ego_state::{EgoState, VehicleParameters};
 pub use frame::{Frame, Light, LightState};
 pub use gump_seed::{Rng, Seed, standard_normal};

@@ -185,6 +185,11 @@ pub struct Lights {
 }
 
 impl Lights {
+    /// The colour of the light of a lane, if it has one.
+    pub fn colour(&self, lane: gump_scene::LaneId) -> Option<LightState> {
+        Some(self.of(Some(lane))?.0)
+    }
+
     fn of(&self, lane: Option<gump_scene::LaneId>) -> Option<(LightState, Option<f64>)> {
         let lane = lane?;
         let at = self.by_lane.binary_search_by_key(&lane, |light| light.0);

@@ -52,7 +52,7 @@ const WAITS_M: f64 = 0.2;
 const RED_AHEAD_M: f64 = 60.0;
 const RED_ASIDE_M: f64 = 6.0;
 /// A move with a fault is drawn again so many times. Chosen by hand.
-const FAULT_REDRAWS: usize = 4;
+const FAULT_REDRAWS: usize = 6;
 /// Radius around a sample in which road edges are considered, metres. Chosen by hand.
 const EDGES_M: f64 = 150.0;
 /// Separates the choice of how a sample is driven from its draws.
@@ -239,7 +239,7 @@ impl TrackDriver for NetworkDriver {
                 let crowd = (&agents[..], &stay[..]);
                 let is_free = |i: usize| look(map, lights, &agents, i).is_free(&agents[i]);
                 let roads: Vec<Road<'_>> = (agents.iter().zip(&stay))
-                    .map(|(now, stay)| Road::ahead_of(now, *stay, streets))
+                    .map(|(now, stay)| Road::ahead_of(now, *stay, streets, lights))
                     .collect();
                 let fault = |i: usize, step: &Pose| roads[i].fault(&agents[i], step, || is_free(i));
                 let ground = (lane_map, &fault as &dyn Fn(usize, &Pose) -> f64);

@@ -2,15 +2,19 @@
 //!
 //! In drives under the rules the network's own motion is its target. What is judged here is the
 //! speed: rules prefer slow draws, so that vehicles would slow down on free roads, more with each
-//! update; and a vehicle that comes to a bend too fast leaves the road whatever is drawn then.
+//! update; and a vehicle that comes to a bend too fast leaves the road whatever is drawn then. One
+//! that comes to a red light too fast runs it.
 
 use std::cell::OnceCell;
 use std::f64::consts::FRAC_PI_6;
 
 use gump_geometry::{Pose, angle_difference};
-use gump_model::relative::graph::Shown;
+use gump_model::relative::graph::{Lights, Shown};
 use gump_model::steps::TOKEN_DT;
-use gump_scene::{AgentKind, BendLimits, Lane, LaneAhead, MapGraph, bend_speed, lanes_ahead};
+use gump_scene::{
+    AgentKind, BendLimits, Lane, LaneAhead, LightState, MapGraph, approach_speed, bend_speed,
+    lanes_ahead,
+};
 
 // All were chosen by hand.
 
@@ -37,21 +41,27 @@ const HARD: BendLimits = BendLimits {
     ahead_m: 60.0,
 };
 /// ... at least this in a step, metres per second.
-const BRAKES_MPS: f64 = 1.0;
+const BRAKES_MPS: f64 = 2.0;
+/// A vehicle that would have to brake harder than this for a red light drives on, m/s². The distance
+/// that its front may be over the line and it still waits, metres.
+const HARDEST_MPS2: f64 = 6.0;
+const OVER_M: f64 = 0.5;
+/// A right turn at red is allowed from this speed, metres per second; it turns by more than this,
+/// radians.
+const TURNS_AT_RED_MPS: f64 = 2.0;
+const RIGHT: f64 = 0.52;
 /// Most that a vehicle gains in a step, that it loses, and its greatest lateral acceleration times
 /// the duration of a step, metres per second: 4, 8 and 5 m/s².
 const GAINS_MPS: f64 = 2.0;
 const LOSES_MPS: f64 = 4.0;
 const SIDEWAYS_MPS: f64 = 2.5;
-/// Slower vehicles can take any bend, metres per second.
-const SLOW_MPS: f64 = 4.0;
 
 /// The road ahead of a vehicle.
 pub(super) struct Road<'a> {
     streets: &'a MapGraph,
     /// The lane that it is on, and its distance from the start, metres.
     on: Option<(&'a Lane, f64)>,
-    /// Greatest speed for the bends ahead, metres per second.
+    /// Greatest speed for the bends and the red lights ahead, metres per second.
     most: f64,
     /// Whether it has nothing to slow down for; determined when it is asked for.
     is_free: OnceCell<bool>,
@@ -61,15 +71,20 @@ pub(super) struct Road<'a> {
 
 impl<'a> Road<'a> {
     /// Of an agent; those that stay where they are, and who is not a vehicle, have no faults.
-    pub(super) fn ahead_of(now: &Shown, stays: bool, streets: &'a MapGraph) -> Self {
+    pub(super) fn ahead_of(
+        now: &Shown,
+        stays: bool,
+        streets: &'a MapGraph,
+        lights: &Lights,
+    ) -> Self {
         let drives = now.body.kind == AgentKind::Vehicle && !stays;
         let on = drives.then(|| lane_under(streets, now.pose)).flatten();
-        let bends = on.filter(|_| now.velocity().length() > SLOW_MPS);
+        let entering = |lane: &Lane, metres: f64| before_red(now, lane, metres, lights);
         Self {
             streets,
             on,
-            most: bends.map_or(f64::INFINITY, |(lane, at)| {
-                bend_speed(streets, lane, at, HARD)
+            most: on.map_or(f64::INFINITY, |(lane, at)| {
+                approach_speed(streets, lane, at, HARD, &entering)
             }),
             is_free: OnceCell::new(),
             drives,
@@ -108,6 +123,23 @@ impl<'a> Road<'a> {
     }
 }
 
+/// The greatest speed of a vehicle before a lane that starts `metres` ahead, for its light, metres per
+/// second.
+fn before_red(now: &Shown, lane: &Lane, metres: f64, lights: &Lights) -> f64 {
+    let room = metres - now.body.length / 2.0;
+    let squared = now.velocity().length_squared();
+    if lights.colour(lane.id) != Some(LightState::Red)
+        || room < -OVER_M
+        || squared > 2.0 * HARDEST_MPS2 * (room + OVER_M)
+    {
+        return f64::INFINITY;
+    }
+    let way = &lane.centerline;
+    let turn = angle_difference(way.pose_at(way.length()).heading, way.pose_at(0.0).heading);
+    let least = if turn < -RIGHT { TURNS_AT_RED_MPS } else { 0.0 };
+    (least * least + 2.0 * HARD.braking_mps2 * room.max(0.0)).sqrt()
+}
+
 /// The lane that a vehicle is on, and its distance from the start, metres.
 fn lane_under(streets: &MapGraph, pose: Pose) -> Option<(&Lane, f64)> {
     let lanes = streets.lanes_near(pose.position, IN_LANE_M);
@@ -141,9 +173,16 @@ fn goes_on(streets: &MapGraph, (lane, at): (&Lane, f64), speed: f64) -> bool {
 mod tests {
     use gump_geometry::dvec2;
     use gump_model::relative::graph::Body;
-    use gump_scene::fixture;
+    use gump_scene::{LaneId, fixture};
 
     use super::*;
+
+    const BODY: Body = Body {
+        kind: AgentKind::Vehicle,
+        length: 4.5,
+        width: 1.9,
+        sized: true,
+    };
 
     fn streets(text: &str) -> MapGraph {
         let scenario = fixture::scenario(&format!("{text}\nego vehicle 0: 5,0")).unwrap();
@@ -153,15 +192,35 @@ mod tests {
     /// The fault of a vehicle at `x` on the lane along x that drives at `speed` and then at `next`
     /// m/s, turning by so many radians.
     fn fault(streets: &MapGraph, x: f64, (speed, next): (f64, f64), turn: f64) -> f64 {
-        let body = Body {
-            kind: AgentKind::Vehicle,
-            length: 4.5,
-            width: 1.9,
-            sized: true,
-        };
-        let now = Shown::first(body, Pose::new(x, 0.0, 0.0), dvec2(speed, 0.0));
+        let now = Shown::first(BODY, Pose::new(x, 0.0, 0.0), dvec2(speed, 0.0));
         let step = Pose::new(next * TOKEN_DT, 0.0, turn);
-        Road::ahead_of(&now, false, streets).fault(&now, &step, || true)
+        Road::ahead_of(&now, false, streets, &Lights::default()).fault(&now, &step, || true)
+    }
+
+    #[test]
+    fn at_red_who_can_stops() {
+        let map = streets(
+            "lane 1: 0,0 60,0 next 2\nlane 2: 60,0 120,0\n\
+             lane 3: 0,50 60,50 next 4\nlane 4: 60,50 66,48 68,30",
+        );
+        let at = |(x, y): (f64, f64), (speed, next): (f64, f64), colour: LightState| {
+            let now = Shown::first(BODY, Pose::new(x, y, 0.0), dvec2(speed, 0.0));
+            let by_lane = [2, 4].map(|lane| (LaneId(lane), colour, None)).to_vec();
+            let road = Road::ahead_of(&now, false, &map, &Lights { by_lane });
+            road.fault(&now, &Pose::new(next * TOKEN_DT, 0.0, 0.0), || false)
+        };
+        let red = |x: f64, speeds| at((x, 0.0), speeds, LightState::Red);
+        // The front is 18 m from the line: 10.4 m/s are the most.
+        assert!(red(39.75, (12.0, 12.0)) > 1.0 && red(39.75, (12.0, 9.9)) == 0.0);
+        assert_eq!(at((39.75, 0.0), (12.0, 12.0), LightState::Green), 0.0);
+        // Standing before it, and a little over it.
+        assert!(red(57.5, (0.0, 2.0)) > 0.0 && red(58.0, (0.0, 1.0)) > 0.0);
+        assert_eq!(red(57.5, (0.0, 0.0)), 0.0);
+        // Too late to stop, or past the line.
+        assert!(red(50.0, (12.0, 12.0)) == 0.0 && red(59.0, (3.0, 3.0)) == 0.0);
+        // A right turn goes slowly.
+        let right = |next: f64| at((57.5, 50.0), (1.5, next), LightState::Red);
+        assert!(right(1.9) == 0.0 && right(3.4) > 0.0);
     }
 
     #[test]
@@ -195,8 +254,8 @@ mod tests {
         // A right angle after 60 m.
         let map = streets("lane 1: 0,0 60,0 60,80");
         let at = |x: f64, speeds: (f64, f64)| fault(&map, x, speeds, 0.0);
-        assert!(at(40.0, (14.0, 14.0)) > 0.9 && at(40.0, (14.0, 13.5)) > 0.4);
-        assert_eq!(at(40.0, (14.0, 12.9)), 0.0);
+        assert!(at(40.0, (14.0, 14.0)) > 1.9 && at(40.0, (14.0, 13.0)) > 0.9);
+        assert_eq!(at(40.0, (14.0, 11.9)), 0.0);
         // Far enough away, or slow enough; and slowing down early is none either.
         assert!(at(10.0, (14.0, 14.0)) == 0.0 && at(40.0, (8.0, 8.0)) == 0.0);
         assert_eq!(at(20.0, (14.0, 13.0)), 0.0);
