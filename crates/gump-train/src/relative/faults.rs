@@ -3,7 +3,8 @@
 //! In drives under the rules the network's own motion is its target. What is judged here is the
 //! speed: rules prefer slow draws, so that vehicles would slow down on free roads, more with each
 //! update; and a vehicle that comes to a bend too fast leaves the road whatever is drawn then. One
-//! that comes to a red light too fast runs it.
+//! that comes to a red light too fast runs it. And the direction at junctions: who turns neither way
+//! where the road ends drives off it.
 
 use std::cell::OnceCell;
 use std::f64::consts::FRAC_PI_6;
@@ -56,6 +57,16 @@ const GAINS_MPS: f64 = 2.0;
 const LOSES_MPS: f64 = 4.0;
 const SIDEWAYS_MPS: f64 = 2.5;
 
+/// A vehicle is at a junction if its lane is in one or leads into one within this, metres. There its
+/// next pose is to be this near to a lane's centre, metres, ...
+const JUNCTION_M: f64 = 10.0;
+const NEAR_LANE_M: f64 = 1.8;
+/// ... and to its direction, radians. A radian beyond counts as this much, metres per second; lanes
+/// farther away than this are not considered, metres.
+const ALONG: f64 = 0.4;
+const PER_RADIAN: f64 = 4.0;
+const LOOK_M: f64 = 5.0;
+
 /// The road ahead of a vehicle.
 pub(super) struct Road<'a> {
     streets: &'a MapGraph,
@@ -63,6 +74,8 @@ pub(super) struct Road<'a> {
     on: Option<(&'a Lane, f64)>,
     /// Greatest speed for the bends and the red lights ahead, metres per second.
     most: f64,
+    /// Whether it is at a junction.
+    turns: bool,
     /// Whether it has nothing to slow down for; determined when it is asked for.
     is_free: OnceCell<bool>,
     /// Whether it is judged at all.
@@ -86,6 +99,7 @@ impl<'a> Road<'a> {
             most: on.map_or(f64::INFINITY, |(lane, at)| {
                 approach_speed(streets, lane, at, HARD, &entering)
             }),
+            turns: on.is_some_and(|on| is_at_junction(streets, on)),
             is_free: OnceCell::new(),
             drives,
         }
@@ -119,8 +133,30 @@ impl<'a> Road<'a> {
             true => lost - SLOWS_MPS,
             false => 0.0,
         };
-        body + bend + slow
+        let astray = match self.turns {
+            true => astray(self.streets, now.pose * *step),
+            false => 0.0,
+        };
+        body + bend + slow + astray
     }
+}
+
+fn is_at_junction(streets: &MapGraph, (lane, at): (&Lane, f64)) -> bool {
+    let is_near = lane.centerline.length() - at < JUNCTION_M;
+    let mut next = streets.successors(lane.id);
+    lane.in_intersection || is_near && next.any(|next| next.in_intersection)
+}
+
+/// By how much a pose at a junction is off the lanes and their directions, metres per second.
+fn astray(streets: &MapGraph, pose: Pose) -> f64 {
+    let near = streets.lanes_near(pose.position, LOOK_M);
+    let off = near.map(|(lane, distance)| {
+        let at = lane.centerline.project(pose.position).arc_length;
+        let way = lane.centerline.pose_at(at).heading;
+        let turned = angle_difference(way, pose.heading).abs();
+        (distance - NEAR_LANE_M).max(0.0) + PER_RADIAN * (turned - ALONG).max(0.0)
+    });
+    off.fold(LOOK_M - NEAR_LANE_M, f64::min)
 }
 
 /// The greatest speed of a vehicle before a lane that starts `metres` ahead, for its light, metres per
@@ -259,6 +295,23 @@ mod tests {
         // Far enough away, or slow enough; and slowing down early is none either.
         assert!(at(10.0, (14.0, 14.0)) == 0.0 && at(40.0, (8.0, 8.0)) == 0.0);
         assert_eq!(at(20.0, (14.0, 13.0)), 0.0);
+    }
+
+    #[test]
+    fn where_the_road_ends_in_a_junction_who_turns_neither_way_is_astray() {
+        let text = "lane 1: 0,0 40,0 next 2,3\nlane 2: 40,0 46,1 51,6 52,12 52,60\n\
+                    lane 3: 40,0 46,-1 51,-6 52,-12 52,-60";
+        let mut parts = streets(text).parts().clone();
+        parts.lanes[1].in_intersection = true;
+        parts.lanes[2].in_intersection = true;
+        let map = MapGraph::new(parts).unwrap();
+        let at = |x: f64, turn: f64| fault(&map, x, (5.0, 5.0), turn);
+        // Still in the lane; then straight on, and along one of the lanes that turn.
+        assert_eq!(at(33.0, 0.0), 0.0);
+        assert!(at(44.0, 0.0) > 0.5 && at(44.0, 0.35) < at(44.0, 0.0));
+        // Elsewhere vehicles may leave the lanes.
+        let straight = streets("lane 1: 0,0 200,0");
+        assert_eq!(fault(&straight, 50.0, (5.0, 5.0), 0.45), 0.0);
     }
 
     #[test]
