@@ -42,8 +42,8 @@ use crate::sampling::SamplingConfig;
 
 pub use live::LiveFuture;
 
-/// Radius of the map around the ego, metres: `FOLLOW_M` and 120 m beyond, so that it reaches around
-/// an ego at that limit. Not tuned.
+/// Radius of the map around the start and around the ego, metres: `FOLLOW_M` and 120 m beyond, so
+/// that it reaches around an ego at that limit. Not tuned.
 pub const MAP_M: f64 = 300.0;
 
 /// Maximum known time since a light changed, seconds: the length of the training scenes.
@@ -200,7 +200,7 @@ impl RelativeWorld {
         let same = |scene: &Weak<Scene>| {
             let scene = scene.upgrade()?;
             let is_same = Arc::ptr_eq(&scene.source, state.map)
-                && scene.centre == centre
+                && scene.centres == [centre]
                 && scene.ego == state.ego
                 && scene.lights == lights;
             is_same.then_some(scene)
@@ -210,7 +210,7 @@ impl RelativeWorld {
         }
         let source = Arc::clone(state.map);
         let here = (state.ego, &lights[..]);
-        let scene = Scene::around(&self.engine, source, centre, here, &self.sampling);
+        let scene = Scene::around(&self.engine, source, vec![centre], here, &self.sampling);
         let scene = Arc::new(scene);
         let mut scenes = known();
         scenes.retain(|scene| scene.strong_count() > 0);
@@ -278,8 +278,9 @@ impl WorldModel for RelativeWorld {
 #[derive(Debug)]
 pub(super) struct Scene {
     source: Arc<MapGraph>,
-    /// The middle of what is laid out.
-    centre: DVec2,
+    /// The points around which it is laid out: where the ego started, where agents keep arriving
+    /// when it has gone, and where it was when the map was laid out.
+    centres: Vec<DVec2>,
     map: VectorMap,
     pub memory: MapMemory,
     /// The edges of the road and the lines before lights, where rules look at them.
@@ -303,24 +304,24 @@ impl Scene {
     fn around(
         engine: &RelativeEngine,
         source: Arc<MapGraph>,
-        centre: DVec2,
+        centres: Vec<DVec2>,
         (ego, lights): (AgentId, &[Light]),
         sampling: &RelativeSampling,
     ) -> Self {
-        let map = VectorMap::new(&source, centre, MAP_M, Hidden::default());
+        let map = VectorMap::around(&source, &centres, MAP_M, Hidden::default());
         Self {
             memory: engine.remember(&map),
             map,
             lane_map: match sampling.redraws {
                 0 => LaneMap::default(),
-                _ => LaneMap::of_curbs(&source, centre, MAP_M),
+                _ => LaneMap::of_curbs(&source, &centres, MAP_M),
             },
             lines: match sampling.redraws {
                 0 => Vec::new(),
                 _ => StopLine::of(&source, lights),
             },
             source,
-            centre,
+            centres,
             ego,
             lights: lights.to_vec(),
         }
@@ -469,9 +470,11 @@ impl Future {
         let Some(ego) = ego.map(|member| member.now().pose.position) else {
             return;
         };
-        if ego.distance(scene.centre) > FOLLOW_M {
+        let (start, last) = (scene.centres[0], scene.centres[scene.centres.len() - 1]);
+        if ego.distance(last) > FOLLOW_M {
             let source = Arc::clone(&scene.source);
-            let next = Scene::around(engine, source, ego, (scene.ego, &self.lights), sampling);
+            let here = (scene.ego, &self.lights[..]);
+            let next = Scene::around(engine, source, vec![start, ego], here, sampling);
             self.scene = Arc::new(next);
         }
     }

@@ -125,12 +125,15 @@ impl LaneMap {
         lane_map
     }
 
-    /// The road edges within `reach` metres of a place, in the frame of the map; no lanes.
-    pub fn of_edges(map: &MapGraph, centre: DVec2, reach: f64) -> Self {
+    /// The road edges within `reach` metres of one of these places, in the frame of the map; no lanes.
+    pub fn of_edges(map: &MapGraph, centres: &[DVec2], reach: f64) -> Self {
         let edges = map.road_edges().iter();
         let stretches = edges.flat_map(|edge| Edge::of(&edge.line, Pose::IDENTITY));
         let edges: Vec<Edge> = stretches
-            .filter(|edge| edge.from.distance_squared(centre) < reach * reach)
+            .filter(|edge| {
+                let mut centres = centres.iter();
+                centres.any(|centre| edge.from.distance_squared(*centre) < reach * reach)
+            })
             .collect();
         Self {
             edge_cells: Cells::new(edges.iter().map(|edge| edge.from)),
@@ -141,7 +144,7 @@ impl LaneMap {
 
     /// As [`Self::of_edges`] without the edges in front of driveways, which vehicles cross: recorded
     /// maps draw the edge of a road on through the mouths of yards and car parks.
-    pub fn of_curbs(map: &MapGraph, centre: DVec2, reach: f64) -> Self {
+    pub fn of_curbs(map: &MapGraph, centres: &[DVec2], reach: f64) -> Self {
         let driveways = map.areas().iter();
         let driveways = driveways.filter(|area| area.kind == AreaKind::Driveway);
         let driveways: Vec<_> = driveways
@@ -155,7 +158,7 @@ impl LaneMap {
                 near && polygon.signed_distance(middle) < DRIVEWAY_M
             })
         };
-        let mut all = Self::of_edges(map, centre, reach);
+        let mut all = Self::of_edges(map, centres, reach);
         all.edges.retain(|edge| !is_open(edge));
         all.edge_cells = Cells::new(all.edges.iter().map(|edge| edge.from));
         all

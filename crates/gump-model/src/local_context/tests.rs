@@ -129,8 +129,8 @@ fn the_mouth_of_a_driveway_is_no_curb() {
         let middles = near.map(|edge| edge.from.midpoint(edge.to).x);
         middles.filter(|x| x.abs() < 8.0).collect::<Vec<_>>()
     };
-    let all = ahead(&LaneMap::of_edges(&map, dvec2(0.0, 0.0), 50.0));
-    let curbs = ahead(&LaneMap::of_curbs(&map, dvec2(0.0, 0.0), 50.0));
+    let all = ahead(&LaneMap::of_edges(&map, &[dvec2(0.0, 0.0)], 50.0));
+    let curbs = ahead(&LaneMap::of_curbs(&map, &[dvec2(0.0, 0.0)], 50.0));
     assert!(all.iter().any(|x| x.abs() < 2.0), "{all:?}");
     assert!(curbs.iter().all(|x| x.abs() > 3.0), "{curbs:?}");
     assert!(curbs.len() >= 3, "{curbs:?}");

@@ -52,7 +52,7 @@ pub(super) enum PieceKind {
 #[derive(Clone, Debug)]
 pub struct Piece {
     /// The middle, along the direction of travel; of an area its centre, along its longer side.
-    pub(super) pose: Pose,
+    pub pose: Pose,
     pub(super) kind: PieceKind,
     /// The same as axes.
     pub(super) axes: Axes,
@@ -95,6 +95,12 @@ pub struct Hidden {
     pub(super) stop_signs: bool,
 }
 
+/// Whether a point is within `reach` metres of one of these.
+fn is_near(point: DVec2, centres: &[DVec2], reach: f64) -> bool {
+    let mut centres = centres.iter();
+    centres.any(|centre| point.distance_squared(*centre) < reach * reach)
+}
+
 /// A map in pieces.
 #[derive(Debug, Default)]
 pub struct VectorMap {
@@ -108,8 +114,13 @@ pub struct VectorMap {
 impl VectorMap {
     /// The pieces of a map within `reach` metres of `centre`.
     pub fn new(map: &MapGraph, centre: DVec2, reach: f64, hidden: Hidden) -> Self {
+        Self::around(map, &[centre], reach, hidden)
+    }
+
+    /// The pieces of a map within `reach` metres of one of these points.
+    pub fn around(map: &MapGraph, centres: &[DVec2], reach: f64, hidden: Hidden) -> Self {
         let mut this = Self::default();
-        let near = |p: DVec2| p.distance_squared(centre) < reach * reach;
+        let near = |p: DVec2| is_near(p, centres, reach);
         this.add_lanes(map, near, hidden);
         for edge in map.road_edges() {
             let kind = match edge.kind {

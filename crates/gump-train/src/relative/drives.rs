@@ -184,7 +184,7 @@ impl TrackDriver for NetworkDriver {
                 .crowd
                 .join(streets, centre, tracks, n_frames, seed.fork(CROWD));
         }
-        let lane_map = ruled.then(|| LaneMap::of_curbs(streets, centre, EDGES_M));
+        let lane_map = ruled.then(|| LaneMap::of_curbs(streets, &[centre], EDGES_M));
         let stays = |track: &Track| track.is_obstacle || is_parked(track, streets);
         // Of drives under the rules alone: the others return to the log anyway.
         let stays: Vec<bool> = match ruled {

@@ -188,6 +188,30 @@ mod tests {
     }
 
     #[test]
+    fn the_map_is_there_around_the_start_and_around_an_ego_that_is_far_from_it() {
+        let road = "lane 1: 0,0 2000,0 speed 15\nego vehicle 0: 10,0 velocity 8,0";
+        let (world, scenario) = (world(), fixture::scenario(road).unwrap());
+        let scene = scenario.present();
+        let mut live = LiveFuture::begin(&world, scene, Seed(4)).unwrap();
+        let mut ego = scene.ego_now().state;
+        for metres in [150.0, 600.0, 1200.0] {
+            ego.pose.position = DVec2::new(metres, 0.0);
+            live.go_on(&world, Some(ego));
+            let pieces = &live.future.scene.map.pieces;
+            let is_there = |x: f64| {
+                let mut at = pieces.iter().map(|piece| piece.pose.position.x);
+                at.any(|at| (at - x).abs() < 20.0)
+            };
+            assert!(is_there(20.0) && is_there(metres) && is_there(metres + 100.0));
+            assert!(!is_there(metres + 400.0));
+        }
+        assert!(
+            live.future.scene.map.pieces.len() < 200,
+            "not the road between"
+        );
+    }
+
+    #[test]
     fn copies_go_their_own_ways() {
         let (world, scenario) = (world(), scenario());
         let mut live = LiveFuture::begin(&world, scenario.present(), Seed(4)).unwrap();
