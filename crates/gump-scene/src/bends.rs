@@ -7,6 +7,8 @@ use crate::{Lane, MapGraph};
 /// Distance of the points between which the way turns, metres: a turn at a junction has three or
 /// more of them, and the noise of a recorded centre line is small beside it. Chosen by hand.
 const STEP_M: f64 = 4.0;
+/// Less is the rounding of a straight line, radians.
+const STRAIGHT: f64 = 1e-6;
 /// Maximum number of lanes in a row: short ones may form a circle.
 const LANES: usize = 10;
 
@@ -30,7 +32,7 @@ pub struct BendLimits {
 /// ```
 /// use gump_scene::{BendLimits, LaneId, bend_speed, fixture};
 ///
-/// // Right angles are bends of about 2.5 m here: points are 4 m apart.
+/// // A right angle counts as a bend of a few metres: points are 4 m apart.
 /// let scenario = fixture::scenario("lane 1: 0,0 50,0 50,-50\nego vehicle 0: 0,0").unwrap();
 /// let lane = scenario.map.lane(LaneId(1)).unwrap();
 /// let limits = BendLimits { lateral_mps2: 3.0, braking_mps2: 2.0, ahead_m: 60.0 };
@@ -100,8 +102,10 @@ impl Rules<'_> {
             let point = lane.centerline.pose_at(at).position;
             let heading = (point - way.from).to_angle();
             let turn = angle_difference(heading, way.heading).abs();
-            let squared = limits.lateral_mps2 * way.turns_over_m / turn.max(1e-9);
-            least = least.min((squared + 2.0 * limits.braking_mps2 * way.driven_m).sqrt());
+            if turn > STRAIGHT {
+                let squared = limits.lateral_mps2 * way.turns_over_m / turn;
+                least = least.min((squared + 2.0 * limits.braking_mps2 * way.driven_m).sqrt());
+            }
             way = Way {
                 from: point,
                 heading,

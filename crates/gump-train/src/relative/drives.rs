@@ -144,6 +144,9 @@ impl RelativeDrives {
     }
 }
 
+/// By how much a move of an agent, given by its index, is beyond what drivers do.
+type Fault<'a> = dyn Fn(usize, &Pose) -> f64 + 'a;
+
 /// A snapshot of the network at a step, which drives.
 pub(crate) struct NetworkDriver {
     engine: RelativeEngine,
@@ -242,7 +245,7 @@ impl TrackDriver for NetworkDriver {
                     .map(|(now, stay)| Road::ahead_of(now, *stay, streets, lights))
                     .collect();
                 let fault = |i: usize, step: &Pose| roads[i].fault(&agents[i], step, || is_free(i));
-                let ground = (lane_map, &fault as &dyn Fn(usize, &Pose) -> f64);
+                let ground = (lane_map, &fault as &Fault<'_>);
                 let moves = self.moves_by_the_rules(crowd, ground, &hidden, seed, &mut room);
                 for ((&a, now), step) in here.iter().zip(&agents).zip(moves) {
                     if let Some(next) = tracks[a].states[t + 1].as_mut().filter(|_| !stays[a]) {
@@ -277,7 +280,7 @@ impl NetworkDriver {
     fn moves_by_the_rules(
         &self,
         (agents, stay): (&[Shown], &[bool]),
-        (lane_map, fault): (&LaneMap, &dyn Fn(usize, &Pose) -> f64),
+        (lane_map, fault): (&LaneMap, &Fault<'_>),
         hidden: &[f32],
         seed: Seed,
         room: &mut Workspace,

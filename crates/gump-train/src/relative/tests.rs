@@ -8,7 +8,7 @@ use gump_model::relative::graph::{Body, NODE_NUMBERS};
 use gump_model::relative::sample::{SampleConfig, State, Track, draw};
 use gump_model::relative::{RelativeConfig, RelativeNetwork, grid, is_relative, load, sample};
 use gump_rollout::{SimulateConfig, Start, WorldModel as _, simulate};
-use gump_scene::{MapGraph, Scenario, Seed, fixture};
+use gump_scene::{Scenario, Seed, fixture};
 
 use super::*;
 
