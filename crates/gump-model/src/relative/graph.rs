@@ -309,6 +309,11 @@ impl View {
     /// about to come near, and no light that is not green. Bends and the end of the road do not
     /// count.
     pub fn is_free(&self, own: &Shown) -> bool {
+        !own.stands() && self.has_room(own)
+    }
+
+    /// The same of an agent that may stand: whether it has room to drive on.
+    pub fn has_room(&self, own: &Shown) -> bool {
         let speed = own.velocity().length();
         let away = |row: &EdgeRow| 30.0 * f64::from(row[OF_PATH + 3]);
         let is_on_path = |row: &EdgeRow| row[OF_PATH..][..PATHS].iter().any(|on| *on > 0.0);
@@ -320,7 +325,7 @@ impl View {
             let is_shut = row[OF_LIGHT + 1] + row[OF_LIGHT + 2] > 0.0;
             is_shut && is_on_path(row) && away(row) < ROOM_M + LIGHT_S * speed
         };
-        !own.stands() && !self.neighbours.iter().any(holds) && !self.pieces.iter().any(shuts)
+        !self.neighbours.iter().any(holds) && !self.pieces.iter().any(shuts)
     }
 }
 

@@ -240,7 +240,7 @@ impl TrackDriver for NetworkDriver {
                 let stay = here.iter().zip(&agents);
                 let stay: Vec<bool> = stay.map(|one| stays[*one.0] || waits(one)).collect();
                 let crowd = (&agents[..], &stay[..]);
-                let is_free = |i: usize| look(map, lights, &agents, i).is_free(&agents[i]);
+                let is_free = |i: usize| look(map, lights, &agents, i).has_room(&agents[i]);
                 let roads: Vec<Road<'_>> = (agents.iter().zip(&stay))
                     .map(|(now, stay)| Road::ahead_of(now, *stay, streets, lights))
                     .collect();

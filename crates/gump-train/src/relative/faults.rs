@@ -4,7 +4,8 @@
 //! speed: rules prefer slow draws, so that vehicles would slow down on free roads, more with each
 //! update; and a vehicle that comes to a bend too fast leaves the road whatever is drawn then. One
 //! that comes to a red light too fast runs it. And the direction at junctions: who turns neither way
-//! where the road ends drives off it.
+//! where the road ends drives off it. Queues would leave later with each update, too: who stands and has
+//! room is drawn again, which makes it start sooner or later.
 
 use std::cell::OnceCell;
 use std::f64::consts::FRAC_PI_6;
@@ -67,16 +68,24 @@ const ALONG: f64 = 0.4;
 const PER_RADIAN: f64 = 4.0;
 const LOOK_M: f64 = 5.0;
 
+/// A vehicle that stands, or moves no farther than this in a step, metres, has this fault, metres per
+/// second, ...
+const CREEPS_M: f64 = 0.15;
+const STAYS_MPS: f64 = 0.3;
+/// ... if it has room, and no junction or stop sign within this, metres, or one that is open to it.
+const START_M: f64 = 12.0;
+
 /// The road ahead of a vehicle.
 pub(super) struct Road<'a> {
     streets: &'a MapGraph,
+    lights: &'a Lights,
     /// The lane that it is on, and its distance from the start, metres.
     on: Option<(&'a Lane, f64)>,
     /// Greatest speed for the bends and the red lights ahead, metres per second.
     most: f64,
     /// Whether it is at a junction.
     turns: bool,
-    /// Whether it has nothing to slow down for; determined when it is asked for.
+    /// Whether it has nothing to slow down for, or to stand for; determined when it is asked for.
     is_free: OnceCell<bool>,
     /// Whether it is judged at all.
     drives: bool,
@@ -88,13 +97,14 @@ impl<'a> Road<'a> {
         now: &Shown,
         stays: bool,
         streets: &'a MapGraph,
-        lights: &Lights,
+        lights: &'a Lights,
     ) -> Self {
         let drives = now.body.kind == AgentKind::Vehicle && !stays;
         let on = drives.then(|| lane_under(streets, now.pose)).flatten();
         let entering = |lane: &Lane, metres: f64| before_red(now, lane, metres, lights);
         Self {
             streets,
+            lights,
             on,
             most: on.map_or(f64::INFINITY, |(lane, at)| {
                 approach_speed(streets, lane, at, HARD, &entering)
@@ -107,13 +117,8 @@ impl<'a> Road<'a> {
 
     /// By how much a move is beyond what drivers do, metres per second; 0 for one that they make.
     ///
-    /// `sees_nothing` says whether the vehicle sees nothing to slow down for.
-    pub(super) fn fault(
-        &self,
-        now: &Shown,
-        step: &Pose,
-        sees_nothing: impl FnOnce() -> bool,
-    ) -> f64 {
+    /// `has_room` says whether the vehicle sees nothing to slow down for, or to stand for.
+    pub(super) fn fault(&self, now: &Shown, step: &Pose, has_room: impl Fn() -> bool) -> f64 {
         if !self.drives {
             return 0.0;
         }
@@ -125,19 +130,28 @@ impl<'a> Road<'a> {
             + (lost - LOSES_MPS).max(0.0)
             + (next * turn - SIDEWAYS_MPS).max(0.0);
         let bend = (next - self.most).min(BRAKES_MPS - lost).max(0.0);
+        let stands = speed * TOKEN_DT <= CREEPS_M;
         let is_free = || {
-            let of_road = || self.on.is_some_and(|on| goes_on(self.streets, on, speed));
-            *self.is_free.get_or_init(|| sees_nothing() && of_road())
+            let of_road = || match self.on {
+                Some(on) if stands => may_start(self.streets, self.lights, on),
+                Some(on) => goes_on(self.streets, on, speed),
+                None => false,
+            };
+            *self.is_free.get_or_init(|| of_road() && has_room())
         };
         let slow = match lost > SLOWS_MPS && turn <= STRAIGHT && is_free() {
             true => lost - SLOWS_MPS,
+            false => 0.0,
+        };
+        let stays = match stands && step.position.length() <= CREEPS_M && is_free() {
+            true => STAYS_MPS,
             false => 0.0,
         };
         let astray = match self.turns {
             true => astray(self.streets, now.pose * *step),
             false => 0.0,
         };
-        body + bend + slow + astray
+        body + bend + slow + stays + astray
     }
 }
 
@@ -205,6 +219,27 @@ fn goes_on(streets: &MapGraph, (lane, at): (&Lane, f64), speed: f64) -> bool {
     goes_on && ahead.iter().all(is_open) && speed < bend_speed(streets, lane, at, EASY)
 }
 
+/// Whether a vehicle that stands may start as far as the road is concerned: no junction or stop sign is
+/// near, it is in a junction, or all that its lane leads to, but left turns, is green.
+fn may_start(streets: &MapGraph, lights: &Lights, (lane, at): (&Lane, f64)) -> bool {
+    let signs = streets.stop_signs();
+    let has_sign = |lane: &Lane| signs.iter().any(|sign| sign.lanes.contains(&lane.id));
+    let (ahead, _) = lanes_ahead(streets, lane, at, START_M);
+    let closed = |part: &&LaneAhead<'_>| {
+        let lane = part.lane;
+        let turn = || {
+            let way = &lane.centerline;
+            let end = way.pose_at(way.length()).heading;
+            angle_difference(end, way.pose_at(0.0).heading)
+        };
+        let is_open = lights.colour(lane.id) == Some(LightState::Green) && turn() < RIGHT;
+        lane.in_intersection && !is_open
+    };
+    let ends = ahead.len() == 1 && lane.centerline.length() - at < START_M;
+    let signed = ahead.iter().any(|part| has_sign(part.lane));
+    lane.in_intersection || !ends && !signed && !ahead[1..].iter().any(|part| closed(&part))
+}
+
 #[cfg(test)]
 mod tests {
     use gump_geometry::dvec2;
@@ -230,7 +265,8 @@ mod tests {
     fn fault(streets: &MapGraph, x: f64, (speed, next): (f64, f64), turn: f64) -> f64 {
         let now = Shown::first(BODY, Pose::new(x, 0.0, 0.0), dvec2(speed, 0.0));
         let step = Pose::new(next * TOKEN_DT, 0.0, turn);
-        Road::ahead_of(&now, false, streets, &Lights::default()).fault(&now, &step, || true)
+        let lights = Lights::default();
+        Road::ahead_of(&now, false, streets, &lights).fault(&now, &step, || true)
     }
 
     #[test]
@@ -242,7 +278,8 @@ mod tests {
         let at = |(x, y): (f64, f64), (speed, next): (f64, f64), colour: LightState| {
             let now = Shown::first(BODY, Pose::new(x, y, 0.0), dvec2(speed, 0.0));
             let by_lane = [2, 4].map(|lane| (LaneId(lane), colour, None)).to_vec();
-            let road = Road::ahead_of(&now, false, &map, &Lights { by_lane });
+            let lights = Lights { by_lane };
+            let road = Road::ahead_of(&now, false, &map, &lights);
             road.fault(&now, &Pose::new(next * TOKEN_DT, 0.0, 0.0), || false)
         };
         let red = |x: f64, speeds| at((x, 0.0), speeds, LightState::Red);
@@ -275,6 +312,36 @@ mod tests {
         // Less, or in a turn.
         assert_eq!(fault(&map, 10.0, (10.0, 9.7), 0.0), 0.0);
         assert_eq!(fault(&map, 10.0, (10.0, 9.0), 0.1), 0.0);
+    }
+
+    #[test]
+    fn who_stands_and_has_room_starts_unless_a_junction_is_closed() {
+        let mut parts =
+            streets("lane 1: 0,0 60,0 next 2\nlane 2: 60,0 90,0 next 3\nlane 3: 90,0 200,0")
+                .parts()
+                .clone();
+        parts.lanes[1].in_intersection = true;
+        let map = MapGraph::new(parts).unwrap();
+        let stays = |x: f64, colour: Option<LightState>, has_room: bool| {
+            let now = Shown::first(BODY, Pose::new(x, 0.0, 0.0), dvec2(0.0, 0.0));
+            let by_lane = colour.map(|colour| (LaneId(2), colour, None));
+            let lights = Lights {
+                by_lane: by_lane.into_iter().collect(),
+            };
+            let road = Road::ahead_of(&now, false, &map, &lights);
+            assert_eq!(
+                road.fault(&now, &Pose::new(0.5, 0.0, 0.0), || has_room),
+                0.0
+            );
+            road.fault(&now, &Pose::IDENTITY, || has_room) > 0.0
+        };
+        use LightState::{Green, Red};
+        // In the lane, with and without room; at the line, by its light; in the junction.
+        assert!(stays(30.0, None, true) && !stays(30.0, None, false));
+        assert!(!stays(55.0, None, true) && !stays(55.0, Some(Red), true));
+        assert!(stays(55.0, Some(Green), true) && stays(75.0, Some(Red), true));
+        // At the end of the map.
+        assert!(!stays(195.0, None, true));
     }
 
     #[test]
