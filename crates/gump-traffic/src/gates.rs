@@ -554,3 +554,49 @@ fn path_from(map: &MapGraph, lane: &Lane, s: f64) -> Option<Polyline> {
     }
     (path.length() > 25.0).then_some(path)
 }
+
+#[cfg(test)]
+mod tests {
+    use gump_scene::{Scenario, fixture};
+
+    use super::*;
+
+    /// A scene, and its gate for vehicles on lane 1, which enters the window 110 m before the ego.
+    fn entry(text: &str) -> (Scenario, Gate) {
+        let scenario = fixture::scenario(&format!("{text}\nego vehicle 0: 0,0")).unwrap();
+        let all = gates(
+            &scenario.map,
+            &[DVec2::ZERO],
+            DVec2::ZERO,
+            &Arrivals::default(),
+        );
+        let mut of_lane = all
+            .into_iter()
+            .filter(|g| (g.kind, g.lane) == (0, LaneId(1)));
+        let gate = of_lane.next().expect("lane 1 leads into the window");
+        (scenario, gate)
+    }
+
+    #[test]
+    fn who_enters_before_a_bend_or_a_red_light_can_take_it_gently() {
+        let (_, straight) = entry("lane 1: -200,0 200,0");
+        assert!(straight.bends.is_infinite());
+        // A right angle after 30 m.
+        let (_, bend) = entry("lane 1: -200,0 -80,0 -80,90");
+        assert!((6.0..12.0).contains(&bend.bends), "{}", bend.bends);
+        let speed = |colour: &str| {
+            let text = format!(
+                "lane 1: -200,0 -60,0 next 2\nlane 2: -60,0 200,0\nlight 2 {colour}: -60,0"
+            );
+            let (scenario, gate) = entry(&text);
+            before_red(&scenario.map, &gate, scenario.present().now().lights())
+        };
+        // 50 m, of which the last 3 are left, with 1.5 m/s².
+        assert!(
+            (speed("red") - 141_f64.sqrt()).abs() < 0.1,
+            "{}",
+            speed("red")
+        );
+        assert!(speed("green").is_infinite());
+    }
+}

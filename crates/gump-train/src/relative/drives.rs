@@ -240,11 +240,12 @@ impl TrackDriver for NetworkDriver {
                 let stay = here.iter().zip(&agents);
                 let stay: Vec<bool> = stay.map(|one| stays[*one.0] || waits(one)).collect();
                 let crowd = (&agents[..], &stay[..]);
-                let is_free = |i: usize| look(map, lights, &agents, i).has_room(&agents[i]);
+                let has_room = |i: usize| look(map, lights, &agents, i).has_room(&agents[i]);
                 let roads: Vec<Road<'_>> = (agents.iter().zip(&stay))
                     .map(|(now, stay)| Road::ahead_of(now, *stay, streets, lights))
                     .collect();
-                let fault = |i: usize, step: &Pose| roads[i].fault(&agents[i], step, || is_free(i));
+                let fault =
+                    |i: usize, step: &Pose| roads[i].fault(&agents[i], step, || has_room(i));
                 let ground = (lane_map, &fault as &Fault<'_>);
                 let moves = self.moves_by_the_rules(crowd, ground, &hidden, seed, &mut room);
                 for ((&a, now), step) in here.iter().zip(&agents).zip(moves) {

@@ -29,7 +29,7 @@ const STRAIGHT: f64 = 0.06;
 const IN_LANE_M: f64 = 1.0;
 const IN_LANE: f64 = FRAC_PI_6;
 /// ... that goes on for this distance without a junction or a stop sign, metres, sees nothing else
-/// (`View::is_free`), and is not faster than drivers like to be before a bend.
+/// (`View::has_room`), and is not faster than drivers like to be before a bend.
 const FREE_M: f64 = 35.0;
 const EASY: BendLimits = BendLimits {
     lateral_mps2: 2.5,
@@ -260,6 +260,14 @@ mod tests {
         MapGraph::new(scenario.map.parts().clone()).unwrap()
     }
 
+    /// A road of 200 m with a junction from 60 to 90 m, lane 2.
+    fn junction() -> MapGraph {
+        let road = "lane 1: 0,0 60,0 next 2\nlane 2: 60,0 90,0 next 3\nlane 3: 90,0 200,0";
+        let mut parts = streets(road).parts().clone();
+        parts.lanes[1].in_intersection = true;
+        MapGraph::new(parts).unwrap()
+    }
+
     /// The fault of a vehicle at `x` on the lane along x that drives at `speed` and then at `next`
     /// m/s, turning by so many radians.
     fn fault(streets: &MapGraph, x: f64, (speed, next): (f64, f64), turn: f64) -> f64 {
@@ -298,12 +306,7 @@ mod tests {
 
     #[test]
     fn slowing_down_on_a_free_road_is_a_fault_and_at_a_junction_is_none() {
-        let mut parts =
-            streets("lane 1: 0,0 60,0 next 2\nlane 2: 60,0 90,0 next 3\nlane 3: 90,0 200,0")
-                .parts()
-                .clone();
-        parts.lanes[1].in_intersection = true;
-        let map = MapGraph::new(parts).unwrap();
+        let map = junction();
         let loses = |x: f64| fault(&map, x, (10.0, 9.0), 0.0);
         assert!((loses(10.0) - 0.6).abs() < 1e-9, "{}", loses(10.0));
         // In the junction and beyond it the road is free again; before it and before its end not.
@@ -316,12 +319,7 @@ mod tests {
 
     #[test]
     fn who_stands_and_has_room_starts_unless_a_junction_is_closed() {
-        let mut parts =
-            streets("lane 1: 0,0 60,0 next 2\nlane 2: 60,0 90,0 next 3\nlane 3: 90,0 200,0")
-                .parts()
-                .clone();
-        parts.lanes[1].in_intersection = true;
-        let map = MapGraph::new(parts).unwrap();
+        let map = junction();
         let stays = |x: f64, colour: Option<LightState>, has_room: bool| {
             let now = Shown::first(BODY, Pose::new(x, 0.0, 0.0), dvec2(0.0, 0.0));
             let by_lane = colour.map(|colour| (LaneId(2), colour, None));
