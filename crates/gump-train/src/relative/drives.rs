@@ -9,10 +9,11 @@
 //! In a share of drives the agents move freely instead, under the rules of
 //! `gump_engine::relative::rules`: draws that would overlap an agent or leave the road are redrawn.
 //! The resulting motion is the target, so that the network learns to follow the rules itself. Its
-//! own draws do not say how often parked vehicles start, nor how often somebody starts at red, so
-//! these stay where the log has them. Nor do they say where vehicles slow down: rules prefer slow
-//! draws, which the network would learn from everywhere. Nor that no way out is left to a vehicle
-//! that comes to a bend too fast. So moves with such faults are drawn again (`faults`).
+//! own draws do not say how often parked vehicles start, nor how often somebody starts at red or at a
+//! stop sign, so these stay where the log has them. Nor do they say where vehicles slow down: rules
+//! prefer slow draws, which the network would learn from everywhere. Nor that no way out is left to a
+//! vehicle that comes to a bend too fast, or to a junction before others. So moves with such faults
+//! are drawn again (`faults`, `right_of_way`).
 
 use gump_engine::relative::engine::{Draw, RelativeEngine, Workspace};
 use gump_engine::relative::rules::resolve;
@@ -31,7 +32,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
 use crate::relative::crowd::Crowd;
-use crate::relative::faults::Road;
+use crate::relative::faults::{Road, sign_lines};
+use crate::relative::right_of_way::{Course, courses, yielding_speed};
 
 /// Frames that are shown as logged before the network drives: one move, so that it has seen agents
 /// move.
@@ -42,15 +44,16 @@ const METRES_PER_RADIAN: f64 = 2.0;
 
 /// A vehicle is parked if its log stays within this of its first pose, metres, ...
 const PARKED_M: f64 = 0.5;
-/// ... off lanes: farther than this from their centre lines, metres. Both were chosen by hand.
+/// ... off lanes: farther than this from their centre lines, metres. Both were chosen by hand. On a
+/// lane it is parked where nothing could have held it.
 const OFF_LANE_M: f64 = 1.5;
-/// A vehicle waits at red if its log moves no farther than this in the next step, metres, it is itself
-/// as near to its log, ...
+/// A vehicle waits at red, or for others at a stop sign, if its log moves no farther than this in the
+/// next step, metres, it is itself as near to its log, ...
 const WAITS_M: f64 = 0.2;
-/// ... and a lane at red starts ahead of it, this far at most, and this far aside, metres. All were
-/// chosen by hand.
-const RED_AHEAD_M: f64 = 60.0;
-const RED_ASIDE_M: f64 = 6.0;
+/// ... and the line is ahead of it, this far at most, and this far aside, metres. All were chosen by
+/// hand.
+const LINE_AHEAD_M: f64 = 60.0;
+const LINE_ASIDE_M: f64 = 6.0;
 /// A move with a fault is drawn again so many times. Chosen by hand.
 const FAULT_REDRAWS: usize = 6;
 /// Radius around a sample in which road edges are considered, metres. Chosen by hand.
@@ -190,10 +193,14 @@ impl TrackDriver for NetworkDriver {
         let lane_map = ruled.then(|| LaneMap::of_curbs(streets, &[centre], EDGES_M));
         let stays = |track: &Track| track.is_obstacle || is_parked(track, streets);
         // Of drives under the rules alone: the others return to the log anyway.
-        let stays: Vec<bool> = match ruled {
-            true => tracks.iter().map(stays).collect(),
-            false => Vec::new(),
+        let (stays, stood): (Vec<bool>, Vec<bool>) = match ruled {
+            true => tracks
+                .iter()
+                .map(|track| (stays(track), stands_throughout(track)))
+                .unzip(),
+            false => (Vec::new(), Vec::new()),
         };
+        let signs: Vec<Pose> = sign_lines(streets).collect();
         // Agents that are led away take their own poses for logged ones.
         let logs: Vec<Vec<Option<Pose>>> = match ruled {
             true => tracks.iter().map(log_of).collect(),
@@ -232,20 +239,35 @@ impl TrackDriver for NetworkDriver {
                 .collect();
             let seed = seed.fork(t as u64);
             if let Some(lane_map) = &lane_map {
-                let red = red_lanes(lights, streets);
-                let waits = |(&a, now): (&usize, &Shown)| {
+                let lines: Vec<Pose> = red_lanes(lights, streets).chain(signs.clone()).collect();
+                let waits = |a: usize, now: &Shown| {
                     tracks[a].body.kind == AgentKind::Vehicle
-                        && waits(now.pose, [logs[a][t], logs[a][t + 1]], &red)
+                        && waits(now.pose, [logs[a][t], logs[a][t + 1]], &lines)
                 };
-                let stay = here.iter().zip(&agents);
-                let stay: Vec<bool> = stay.map(|one| stays[*one.0] || waits(one)).collect();
-                let crowd = (&agents[..], &stay[..]);
                 let has_room = |i: usize| look(map, lights, &agents, i).has_room(&agents[i]);
-                let roads: Vec<Road<'_>> = (agents.iter().zip(&stay))
-                    .map(|(now, stay)| Road::ahead_of(now, *stay, streets, lights))
-                    .collect();
-                let fault =
-                    |i: usize, step: &Pose| roads[i].fault(&agents[i], step, || has_room(i));
+                let ways = |now: &Shown| match now.body.kind {
+                    AgentKind::Vehicle | AgentKind::Bicycle => courses(streets, lights, now),
+                    _ => Vec::new(),
+                };
+                let ways: Vec<Vec<Course>> = agents.iter().map(ways).collect();
+                let yields = |i: usize| {
+                    let others = ways.iter().enumerate().filter(|(j, _)| *j != i);
+                    yielding_speed(&ways[i], &others.map(|(_, way)| &way[..]))
+                };
+                let mut stay = Vec::new();
+                let mut roads = Vec::new();
+                for (i, (&a, now)) in here.iter().zip(&agents).enumerate() {
+                    let holds = stays[a] || waits(a, now);
+                    let road = Road::ahead_of(now, holds, streets, lights).yielding(yields(i));
+                    let is_left = || stood[a] && road.is_beside_nothing() && has_room(i);
+                    stay.push(holds || is_left());
+                    roads.push(road);
+                }
+                let crowd = (&agents[..], &stay[..]);
+                let fault = |i: usize, step: &Pose| match stay[i] {
+                    true => 0.0,
+                    false => roads[i].fault(&agents[i], step, || has_room(i)),
+                };
                 let ground = (lane_map, &fault as &Fault<'_>);
                 let moves = self.moves_by_the_rules(crowd, ground, &hidden, seed, &mut room);
                 for ((&a, now), step) in here.iter().zip(&agents).zip(moves) {
@@ -344,24 +366,32 @@ impl NetworkDriver {
 
 /// Whether a vehicle stands beside the lanes throughout its log.
 fn is_parked(track: &Track, streets: &MapGraph) -> bool {
+    let first = track.states.iter().flatten().next();
+    let is_off = first.is_some_and(|first| {
+        let mut near = streets.lanes_near(first.logged.position, OFF_LANE_M);
+        near.next().is_none()
+    });
+    is_off && stands_throughout(track)
+}
+
+/// Whether a vehicle stands throughout its log.
+fn stands_throughout(track: &Track) -> bool {
     let mut logged = track.states.iter().flatten().map(|state| state.logged);
     let Some(first) = logged.next() else {
         return false;
     };
-    let place = first.position;
-    track.body.kind == AgentKind::Vehicle
-        && logged.all(|pose| pose.position.distance(place) < PARKED_M)
-        && streets.lanes_near(place, OFF_LANE_M).next().is_none()
+    let stays = |pose: Pose| pose.position.distance(first.position) < PARKED_M;
+    track.body.kind == AgentKind::Vehicle && logged.all(stays)
 }
 
 /// Where lanes at red start.
-fn red_lanes(lights: &Lights, streets: &MapGraph) -> Vec<Pose> {
+fn red_lanes(lights: &Lights, streets: &MapGraph) -> impl Iterator<Item = Pose> {
     let red = lights
         .by_lane
         .iter()
         .filter(|(_, state, _)| *state == LightState::Red);
     let start = |id| Some(streets.lane(id)?.centerline.pose_at(0.0));
-    red.filter_map(|(id, _, _)| start(*id)).collect()
+    red.filter_map(move |(id, _, _)| start(*id))
 }
 
 /// The logged poses of a track.
@@ -370,20 +400,20 @@ fn log_of(track: &Track) -> Vec<Option<Pose>> {
     states.map(|state| Some((*state)?.logged)).collect()
 }
 
-/// Whether an agent that is `here` stands where its log does, `now` and in the next frame, and a lane at
-/// red ahead is the reason.
-pub(super) fn waits(here: Pose, [now, next]: [Option<Pose>; 2], red: &[Pose]) -> bool {
+/// Whether an agent that is `here` stands where its log does, `now` and in the next frame, and a line
+/// ahead, where a lane at red starts or a stop sign holds, is the reason.
+pub(super) fn waits(here: Pose, [now, next]: [Option<Pose>; 2], lines: &[Pose]) -> bool {
     let (Some(now), Some(next)) = (now, next) else {
         return false;
     };
     let near = |a: Pose, b: Pose| a.position.distance(b.position) < WAITS_M;
     let ahead = |line: &Pose| {
         let local = here.inverse() * *line;
-        (0.0..RED_AHEAD_M).contains(&local.position.x)
-            && local.position.y.abs() < RED_ASIDE_M
+        (0.0..LINE_AHEAD_M).contains(&local.position.x)
+            && local.position.y.abs() < LINE_ASIDE_M
             && local.heading.cos() > 0.7
     };
-    near(now, next) && near(here, now) && red.iter().any(ahead)
+    near(now, next) && near(here, now) && lines.iter().any(ahead)
 }
 
 /// Distance between two poses, metres.

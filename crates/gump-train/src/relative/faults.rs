@@ -47,11 +47,13 @@ const BRAKES_MPS: f64 = 2.0;
 /// A vehicle that would have to brake harder than this for a red light drives on, m/s². The distance
 /// that its front may be over the line and it still waits, metres.
 const HARDEST_MPS2: f64 = 6.0;
-const OVER_M: f64 = 0.5;
+pub(super) const OVER_M: f64 = 0.5;
 /// A right turn at red is allowed from this speed, metres per second; it turns by more than this,
 /// radians.
 const TURNS_AT_RED_MPS: f64 = 2.0;
 const RIGHT: f64 = 0.52;
+/// The same at stop signs: hardly a recorded driver is faster at the line.
+const ROLLS_MPS: f64 = 2.5;
 /// Most that a vehicle gains in a step, that it loses, and its greatest lateral acceleration times
 /// the duration of a step, metres per second: 4, 8 and 5 m/s².
 const GAINS_MPS: f64 = 2.0;
@@ -81,8 +83,11 @@ pub(super) struct Road<'a> {
     lights: &'a Lights,
     /// The lane that it is on, and its distance from the start, metres.
     on: Option<(&'a Lane, f64)>,
-    /// Greatest speed for the bends and the red lights ahead, metres per second.
+    /// Greatest speed for the bends, lights, signs and vehicles with right of way ahead, metres per
+    /// second.
     most: f64,
+    /// Whether it has to let others pass.
+    yields: bool,
     /// Whether it is at a junction.
     turns: bool,
     /// Whether it has nothing to slow down for, or to stand for; determined when it is asked for.
@@ -101,7 +106,10 @@ impl<'a> Road<'a> {
     ) -> Self {
         let drives = now.body.kind == AgentKind::Vehicle && !stays;
         let on = drives.then(|| lane_under(streets, now.pose)).flatten();
-        let entering = |lane: &Lane, metres: f64| before_red(now, lane, metres, lights);
+        let entering = |lane: &Lane, metres: f64| {
+            let red = before_red(now, lane, metres, lights);
+            red.min(before_sign(streets, now, lane, metres))
+        };
         Self {
             streets,
             lights,
@@ -109,10 +117,32 @@ impl<'a> Road<'a> {
             most: on.map_or(f64::INFINITY, |(lane, at)| {
                 approach_speed(streets, lane, at, HARD, &entering)
             }),
+            yields: false,
             turns: on.is_some_and(|on| is_at_junction(streets, on)),
             is_free: OnceCell::new(),
             drives,
         }
+    }
+
+    /// The same of a vehicle that has to let others pass at this speed at most, metres per second;
+    /// infinite for one that has not.
+    pub(super) fn yielding(self, most: f64) -> Self {
+        Self {
+            most: self.most.min(most),
+            yields: most.is_finite(),
+            ..self
+        }
+    }
+
+    /// Whether a vehicle that stands here for long is parked, unless an agent is in its way: no
+    /// junction, stop sign or light is near.
+    pub(super) fn is_beside_nothing(&self) -> bool {
+        let Some((lane, at)) = self.on else {
+            return false;
+        };
+        let (ahead, _) = lanes_ahead(self.streets, lane, at, FREE_M);
+        let lit = |part: &LaneAhead<'_>| self.lights.colour(part.lane.id).is_some();
+        !ahead.iter().any(lit) && goes_on(self.streets, (lane, at), 0.0)
     }
 
     /// By how much a move is beyond what drivers do, metres per second; 0 for one that they make.
@@ -137,7 +167,9 @@ impl<'a> Road<'a> {
                 Some(on) => goes_on(self.streets, on, speed),
                 None => false,
             };
-            *self.is_free.get_or_init(|| of_road() && has_room())
+            *self
+                .is_free
+                .get_or_init(|| !self.yields && of_road() && has_room())
         };
         let slow = match lost > SLOWS_MPS && turn <= STRAIGHT && is_free() {
             true => lost - SLOWS_MPS,
@@ -176,22 +208,61 @@ fn astray(streets: &MapGraph, pose: Pose) -> f64 {
 /// The greatest speed of a vehicle before a lane that starts `metres` ahead, for its light, metres per
 /// second.
 fn before_red(now: &Shown, lane: &Lane, metres: f64, lights: &Lights) -> f64 {
-    let room = metres - now.body.length / 2.0;
-    let squared = now.velocity().length_squared();
-    if lights.colour(lane.id) != Some(LightState::Red)
-        || room < -OVER_M
-        || squared > 2.0 * HARDEST_MPS2 * (room + OVER_M)
-    {
+    if lights.colour(lane.id) != Some(LightState::Red) {
         return f64::INFINITY;
     }
     let way = &lane.centerline;
     let turn = angle_difference(way.pose_at(way.length()).heading, way.pose_at(0.0).heading);
     let least = if turn < -RIGHT { TURNS_AT_RED_MPS } else { 0.0 };
+    before_line(now, metres, least)
+}
+
+/// The same for its stop sign, at which drivers roll on at most.
+fn before_sign(streets: &MapGraph, now: &Shown, lane: &Lane, metres: f64) -> f64 {
+    let ends = |before: &Lane| !before.in_intersection && has_sign(streets, before);
+    let stops = match has_sign(streets, lane) {
+        true => lane.in_intersection,
+        false => streets.predecessors(lane.id).any(ends),
+    };
+    match stops {
+        true => before_line(now, metres, ROLLS_MPS),
+        false => f64::INFINITY,
+    }
+}
+
+/// The greatest speed of a vehicle before a line that it crosses at `least` metres per second at most;
+/// infinite if it is over the line, or too fast to get there.
+pub(super) fn before_line(now: &Shown, metres: f64, least: f64) -> f64 {
+    let room = metres - now.body.length / 2.0;
+    let squared = now.velocity().length_squared() - least * least;
+    if room < -OVER_M || squared > 2.0 * HARDEST_MPS2 * (room + OVER_M) {
+        return f64::INFINITY;
+    }
     (least * least + 2.0 * HARD.braking_mps2 * room.max(0.0)).sqrt()
 }
 
+/// Whether a stop sign applies to a lane: at its start if it is in a junction, at its end otherwise.
+pub(super) fn has_sign(streets: &MapGraph, lane: &Lane) -> bool {
+    let signs = streets.stop_signs();
+    signs.iter().any(|sign| sign.lanes.contains(&lane.id))
+}
+
+/// Where vehicles stop for signs.
+pub(super) fn sign_lines(streets: &MapGraph) -> impl Iterator<Item = Pose> + '_ {
+    let signed = streets.stop_signs().iter().flat_map(|sign| &sign.lanes);
+    signed.filter_map(|id| {
+        let lane = streets.lane(*id)?;
+        let way = &lane.centerline;
+        Some(way.pose_at(if lane.in_intersection {
+            0.0
+        } else {
+            way.length()
+        }))
+    })
+}
+
 /// The lane that a vehicle is on, and its distance from the start, metres.
-fn lane_under(streets: &MapGraph, pose: Pose) -> Option<(&Lane, f64)> {
+pub(super) fn lane_under(streets: &MapGraph, pose: Pose) -> Option<(&Lane, f64)> {
     let lanes = streets.lanes_near(pose.position, IN_LANE_M);
     let on = lanes.filter_map(|(lane, distance)| {
         let at = lane.centerline.project(pose.position).arc_length;
@@ -206,15 +277,9 @@ fn lane_under(streets: &MapGraph, pose: Pose) -> Option<(&Lane, f64)> {
 /// speed slow down for.
 fn goes_on(streets: &MapGraph, (lane, at): (&Lane, f64), speed: f64) -> bool {
     let (ahead, goes_on) = lanes_ahead(streets, lane, at, FREE_M);
-    let stops = |id| {
-        streets
-            .stop_signs()
-            .iter()
-            .any(|sign| sign.lanes.contains(&id))
-    };
     let is_open = |part: &LaneAhead<'_>| {
         let is_junction = part.lane.in_intersection && part.lane.id != lane.id;
-        !is_junction && !stops(part.lane.id)
+        !is_junction && !has_sign(streets, part.lane)
     };
     goes_on && ahead.iter().all(is_open) && speed < bend_speed(streets, lane, at, EASY)
 }
@@ -222,8 +287,6 @@ fn goes_on(streets: &MapGraph, (lane, at): (&Lane, f64), speed: f64) -> bool {
 /// Whether a vehicle that stands may start as far as the road is concerned: no junction or stop sign is
 /// near, it is in a junction, or all that its lane leads to, but left turns, is green.
 fn may_start(streets: &MapGraph, lights: &Lights, (lane, at): (&Lane, f64)) -> bool {
-    let signs = streets.stop_signs();
-    let has_sign = |lane: &Lane| signs.iter().any(|sign| sign.lanes.contains(&lane.id));
     let (ahead, _) = lanes_ahead(streets, lane, at, START_M);
     let closed = |part: &&LaneAhead<'_>| {
         let lane = part.lane;
@@ -236,15 +299,15 @@ fn may_start(streets: &MapGraph, lights: &Lights, (lane, at): (&Lane, f64)) -> b
         lane.in_intersection && !is_open
     };
     let ends = ahead.len() == 1 && lane.centerline.length() - at < START_M;
-    let signed = ahead.iter().any(|part| has_sign(part.lane));
+    let signed = ahead.iter().any(|part| has_sign(streets, part.lane));
     lane.in_intersection || !ends && !signed && !ahead[1..].iter().any(|part| closed(&part))
 }
 
 #[cfg(test)]
 mod tests {
-    use gump_geometry::dvec2;
+    use gump_geometry::{DVec3, dvec2};
     use gump_model::relative::graph::Body;
-    use gump_scene::{LaneId, fixture};
+    use gump_scene::{LaneId, StopSign, fixture};
 
     use super::*;
 
@@ -302,6 +365,62 @@ mod tests {
         // A right turn goes slowly.
         let right = |next: f64| at((57.5, 50.0), (1.5, next), LightState::Red);
         assert!(right(1.9) == 0.0 && right(3.4) > 0.0);
+    }
+
+    #[test]
+    fn at_a_stop_sign_nobody_is_fast() {
+        let map = |lane: i64| {
+            let mut parts = junction().parts().clone();
+            parts.stop_signs.push(StopSign {
+                id: 9,
+                position: DVec3::new(60.0, -3.0, 0.0),
+                lanes: vec![LaneId(lane)],
+            });
+            MapGraph::new(parts).unwrap()
+        };
+        // It applies to the lane before the line, or to the one behind it.
+        for map in [map(1), map(2)] {
+            let lines: Vec<Pose> = sign_lines(&map).collect();
+            assert_eq!(lines, [Pose::new(60.0, 0.0, 0.0)]);
+            // Its front is 10 m from the line: 8.1 m/s are the most.
+            assert!(fault(&map, 47.75, (10.0, 10.0), 0.0) > 1.0);
+            assert_eq!(fault(&map, 47.75, (8.5, 8.0), 0.0), 0.0);
+            // At the line; on a clear road it is none, nor where it could not stop any more.
+            assert!(fault(&map, 57.7, (3.4, 3.2), 0.0) > 0.5);
+            assert!(fault(&map, 57.7, (3.0, 2.4), 0.0) == 0.0);
+            assert!(fault(&junction(), 57.7, (3.4, 3.2), 0.0) == 0.0);
+            assert!(fault(&map, 57.0, (12.0, 12.0), 0.0) == 0.0);
+        }
+    }
+
+    #[test]
+    fn who_gives_way_brakes_and_does_not_start() {
+        let map = junction();
+        let lights = Lights::default();
+        let at = |x: f64, (speed, next): (f64, f64), most: f64| {
+            let now = Shown::first(BODY, Pose::new(x, 0.0, 0.0), dvec2(speed, 0.0));
+            let road = Road::ahead_of(&now, false, &map, &lights).yielding(most);
+            road.fault(&now, &Pose::new(next * TOKEN_DT, 0.0, 0.0), || true)
+        };
+        assert!(at(40.0, (8.0, 8.0), 6.0) > 1.0 && at(40.0, (8.0, 6.0), 6.0) == 0.0);
+        // In a junction it may stand for others.
+        assert!(at(75.0, (0.0, 2.0), 0.0) > 0.0 && at(75.0, (0.0, 0.0), 0.0) == 0.0);
+        assert!(at(75.0, (0.0, 0.0), f64::INFINITY) > 0.0);
+    }
+
+    #[test]
+    fn who_stands_away_from_junctions_and_lights_is_parked() {
+        let map = junction();
+        let red = Lights {
+            by_lane: vec![(LaneId(2), LightState::Red, None)],
+        };
+        let left = |x: f64, lights: &Lights| {
+            let now = Shown::first(BODY, Pose::new(x, 0.0, 0.0), dvec2(0.0, 0.0));
+            Road::ahead_of(&now, false, &map, lights).is_beside_nothing()
+        };
+        let none = Lights::default();
+        assert!(left(120.0, &none) && left(10.0, &none) && !left(40.0, &none));
+        assert!(!left(75.0, &red) && !left(180.0, &none));
     }
 
     #[test]

@@ -4,6 +4,7 @@ mod crowd;
 mod drives;
 mod faults;
 mod rewards;
+mod right_of_way;
 #[cfg(test)]
 mod tests;
 mod train;

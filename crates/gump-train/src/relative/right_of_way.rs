@@ -1,0 +1,370 @@
+//! Who gives way at junctions.
+//!
+//! The rules of sampling look 1.5 s ahead, along each agent's last turn. Two vehicles whose lanes
+//! cross in a junction see each other too late by that: both drive in, and brake or touch in the
+//! middle. Here vehicles are looked at along their lanes, for as long as it takes to stop gently, and
+//! the one that has to give way gets a greatest speed.
+
+use gump_geometry::{DVec2, angle_difference};
+use gump_model::relative::graph::{Lights, Shown};
+use gump_scene::{Lane, LightState, MapGraph};
+
+use crate::relative::faults::{OVER_M, before_line, has_sign, lane_under};
+
+// All were chosen by hand.
+
+/// Courses are this long, metres, with a point every metre.
+const REACH_M: usize = 40;
+/// At most this many courses per vehicle, and lanes per course.
+const COURSES: usize = 6;
+const LANES: usize = 8;
+/// Two courses meet where they are nearer than half of both widths and this, metres, ...
+const BESIDE_M: f64 = 0.4;
+/// ... for this far at most, metres: lanes that merge stay together.
+const TOGETHER_M: f64 = 6.0;
+/// Who comes to the place of meeting later than this does not count, seconds; nor do two that are there
+/// with this between them, seconds.
+const SOON_S: f64 = 5.0;
+const APART_S: f64 = 0.8;
+/// A vehicle slower than this is not about to come, metres per second.
+const MOVES_MPS: f64 = 1.0;
+/// One that gives way starts with this acceleration otherwise, m/s², and stops this far before the
+/// place, metres.
+const STARTS_MPS2: f64 = 1.2;
+const BEFORE_M: f64 = 1.0;
+/// A course that turns by more than this turns, radians; it is towards another that comes from the
+/// opposite direction within this.
+const TURNS: f64 = 0.5;
+const OPPOSITE: f64 = 0.8;
+
+/// A way of a vehicle along its lanes.
+pub(super) struct Course {
+    /// Every metre from its centre.
+    points: Vec<DVec2>,
+    /// Direction at the start, radians, and by how much it turns, to the left above 0.
+    heading: f64,
+    turn: f64,
+    /// Metres to the first junction that it drives into; `None` if there is none.
+    line_m: Option<f64>,
+    /// Whether it is in a junction now.
+    is_inside: bool,
+    /// Whether a stop sign applies at the line.
+    is_signed: bool,
+    /// Whether the light at the line is red.
+    is_red: bool,
+    now: Shown,
+}
+
+/// The ways ahead of a vehicle that is on a lane, shortest turn first.
+pub(super) fn courses(streets: &MapGraph, lights: &Lights, now: &Shown) -> Vec<Course> {
+    let Some((lane, at)) = lane_under(streets, now.pose) else {
+        return Vec::new();
+    };
+    let mut all = Vec::new();
+    let mut way = vec![lane];
+    walk(streets, &mut way, lane.centerline.length() - at, &mut all);
+    let course = |way: &Vec<&Lane>| course(streets, lights, now, way, at);
+    let mut courses: Vec<Course> = all.iter().map(course).collect();
+    courses.sort_by(|a, b| a.turn.abs().total_cmp(&b.turn.abs()));
+    courses
+}
+
+/// Collects the ways from the last lane of `way`, which ends `metres` ahead.
+fn walk<'a>(
+    streets: &'a MapGraph,
+    way: &mut Vec<&'a Lane>,
+    metres: f64,
+    all: &mut Vec<Vec<&'a Lane>>,
+) {
+    let last = way[way.len() - 1];
+    let mut next = streets.successors(last.id).peekable();
+    if metres >= REACH_M as f64 || way.len() == LANES || next.peek().is_none() {
+        all.push(way.clone());
+        return;
+    }
+    for lane in next {
+        if all.len() < COURSES {
+            way.push(lane);
+            walk(streets, way, metres + lane.centerline.length(), all);
+            way.pop();
+        }
+    }
+}
+
+fn course(streets: &MapGraph, lights: &Lights, now: &Shown, way: &[&Lane], at: f64) -> Course {
+    let (mut points, mut base, mut line) = (Vec::new(), -at, None);
+    let mut end = way[0].centerline.pose_at(at).heading;
+    let heading = end;
+    for (i, lane) in way.iter().enumerate() {
+        let length = lane.centerline.length();
+        if i > 0 && line.is_none() && lane.in_intersection && !way[i - 1].in_intersection {
+            line = Some((base, way[i - 1], *lane));
+        }
+        while points.len() <= REACH_M && points.len() as f64 <= base + length {
+            let pose = lane.centerline.pose_at(points.len() as f64 - base);
+            points.push(pose.position);
+            end = pose.heading;
+        }
+        base += length;
+    }
+    let is_inside = way[0].in_intersection;
+    Course {
+        points,
+        heading,
+        turn: angle_difference(end, heading),
+        line_m: line.filter(|_| !is_inside).map(|(metres, ..)| metres),
+        is_inside,
+        is_signed: line
+            .is_some_and(|(_, before, lane)| has_sign(streets, before) || has_sign(streets, lane)),
+        is_red: line.is_some_and(|(_, _, lane)| lights.colour(lane.id) == Some(LightState::Red)),
+        now: *now,
+    }
+}
+
+/// The greatest speed of a vehicle for those that it has to let pass, metres per second: on the best of
+/// its courses. Infinite if nobody comes. `others` are the courses of each other vehicle, the likeliest
+/// first.
+pub(super) fn yielding_speed<'a>(
+    own: &[Course],
+    others: &(impl Iterator<Item = &'a [Course]> + Clone),
+) -> f64 {
+    let of = |course: &Course| {
+        let limits = others
+            .clone()
+            .filter_map(|other| course.limit(other.first()?));
+        limits.fold(f64::INFINITY, f64::min)
+    };
+    own.iter().map(of).reduce(f64::max).unwrap_or(f64::INFINITY)
+}
+
+/// Where two courses meet, metres from the centres.
+struct Meeting {
+    own: (f64, f64),
+    other: (f64, f64),
+}
+
+impl Course {
+    fn speed(&self) -> f64 {
+        self.now.velocity().length()
+    }
+
+    /// The greatest speed if this one has to let another pass.
+    fn limit(&self, other: &Self) -> Option<f64> {
+        let stays_out = other.is_red && !other.is_inside;
+        if (self.line_m.is_none() && !self.is_inside) || stays_out || other.speed() < MOVES_MPS {
+            return None;
+        }
+        let meeting = self.meets(other)?;
+        let half = 0.5 * (self.now.body.length + other.now.body.length);
+        let mine = self.times(meeting.own, half);
+        let its = other.times(meeting.other, half);
+        let is_soon = mine.0 < SOON_S && its.0 < SOON_S;
+        let is_apart = mine.0 > its.1 + APART_S || its.0 > mine.1 + APART_S;
+        if !is_soon || is_apart || !self.gives_way(other, mine.0 > its.0) {
+            return None;
+        }
+        let place = meeting.own.0 - BEFORE_M;
+        // It waits at the line, if it is not over it.
+        let line = self
+            .line_m
+            .filter(|line| line - self.now.body.length / 2.0 > -OVER_M);
+        Some(before_line(
+            &self.now,
+            line.map_or(place, |line| line.min(place)),
+            0.0,
+        ))
+    }
+
+    /// Whether it has to let another pass that it meets; `is_later` says who comes there first.
+    fn gives_way(&self, other: &Self, is_later: bool) -> bool {
+        let opposite =
+            angle_difference(self.heading, other.heading).abs() > std::f64::consts::PI - OPPOSITE;
+        let crosses = |one: &Self, to: &Self| opposite && one.turn > TURNS && to.turn < TURNS;
+        if crosses(self, other) != crosses(other, self) {
+            return crosses(self, other);
+        }
+        if self.is_inside != other.is_inside {
+            return other.is_inside;
+        }
+        if !self.is_inside && self.is_signed != other.is_signed {
+            return self.is_signed;
+        }
+        is_later
+    }
+
+    /// Seconds until it comes to a stretch of its course and has left it.
+    fn times(&self, (from, to): (f64, f64), half: f64) -> (f64, f64) {
+        let speed = self.speed();
+        let until = |metres: f64| match metres > 0.0 {
+            // Vehicles that wait start.
+            true if speed < MOVES_MPS => (2.0 * metres / STARTS_MPS2).sqrt(),
+            true => metres / speed,
+            false => 0.0,
+        };
+        (until(from - half), until(to + half))
+    }
+
+    /// The first stretch on which two courses are beside or on each other, if they come from apart.
+    fn meets(&self, other: &Self) -> Option<Meeting> {
+        let near = 0.5 * (self.now.body.width + other.now.body.width) + BESIDE_M;
+        let hits = |point: &DVec2| {
+            let distance = |(j, of): (usize, &DVec2)| (of.distance_squared(*point), j);
+            let nearest = other.points.iter().enumerate().map(distance);
+            let nearest = nearest.min_by(|a, b| a.0.total_cmp(&b.0))?;
+            (nearest.0 < near * near).then_some(nearest.1 as f64)
+        };
+        let mut found: Option<Meeting> = None;
+        for (i, point) in self.points.iter().enumerate() {
+            match (hits(point), &mut found) {
+                (Some(at), None) => {
+                    found = Some(Meeting {
+                        own: (i as f64, i as f64),
+                        other: (at, at),
+                    });
+                }
+                (Some(at), Some(meeting)) => {
+                    meeting.own.1 = i as f64;
+                    meeting.other = (meeting.other.0.min(at), meeting.other.1.max(at));
+                }
+                (None, None) => {}
+                (None, Some(_)) => break,
+            }
+        }
+        // Not one behind the other, nor already beside each other.
+        let mut meeting = found.filter(|at| at.own.0 > 0.0 && at.other.0 > 0.0)?;
+        for stretch in [&mut meeting.own, &mut meeting.other] {
+            stretch.1 = stretch.1.min(stretch.0 + TOGETHER_M);
+        }
+        Some(meeting)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use gump_geometry::{DVec3, Pose};
+    use gump_model::relative::graph::Body;
+    use gump_scene::{AgentKind, LaneId, StopSign, fixture};
+
+    use super::*;
+
+    /// Lanes from the west, the south and the east meet; 12 turns left from the west. Those of the
+    /// junction are 2, 5, 8 and 12; a stop sign applies to those stated.
+    fn crossing(signed: &[i64]) -> MapGraph {
+        let scenario = fixture::scenario(
+            "lane 1: 0,0 40,0 next 2,12\nlane 2: 40,0 60,0 next 3\nlane 3: 60,0 120,0\n\
+             lane 4: 52,-60 52,-10 next 5\nlane 5: 52,-10 52,10 next 6\nlane 6: 52,10 52,60\n\
+             lane 7: 120,5 60,5 next 8\nlane 8: 60,5 40,5 next 9\nlane 9: 40,5 0,5\n\
+             lane 12: 40,0 46,1 50,4 52,10 next 6\nego vehicle 0: 5,0",
+        )
+        .unwrap();
+        let mut parts = scenario.map.parts().clone();
+        for lane in &mut parts.lanes {
+            lane.in_intersection = [2, 5, 8, 12].contains(&lane.id.0);
+        }
+        parts.stop_signs.push(StopSign {
+            id: 20,
+            position: DVec3::ZERO,
+            lanes: signed.iter().map(|id| LaneId(*id)).collect(),
+        });
+        MapGraph::new(parts).unwrap()
+    }
+
+    const WEST: f64 = 0.0;
+    const SOUTH: f64 = std::f64::consts::FRAC_PI_2;
+    const EAST: f64 = std::f64::consts::PI;
+
+    fn car((x, y): (f64, f64), heading: f64, speed: f64) -> Shown {
+        let body = Body {
+            kind: AgentKind::Vehicle,
+            length: 4.5,
+            width: 1.9,
+            sized: true,
+        };
+        let velocity = DVec2::from_angle(heading) * speed;
+        Shown::first(body, Pose::new(x, y, heading), velocity)
+    }
+
+    /// The greatest speeds of two vehicles for each other.
+    fn speeds(map: &MapGraph, lights: &Lights, own: Shown, other: Shown) -> (f64, f64) {
+        let [own, other] = [own, other].map(|now| courses(map, lights, &now));
+        let of = |one: &[Course], to: &Vec<Course>| yielding_speed(one, &std::iter::once(&to[..]));
+        (of(&own, &other), of(&other, &own))
+    }
+
+    #[test]
+    fn who_comes_later_gives_way() {
+        let map = crossing(&[]);
+        let meet = |x: f64, speed: f64, other: f64| {
+            let own = car((x, 0.0), WEST, speed);
+            speeds(
+                &map,
+                &Lights::default(),
+                own,
+                car((52.0, -30.0), SOUTH, other),
+            )
+        };
+        // 32 m at 8 m/s and 30 m at 10: the line is 20 m ahead.
+        let (own, other) = meet(20.0, 8.0, 10.0);
+        assert!((own - (6.0_f64 * 17.75).sqrt()).abs() < 0.5, "{own}");
+        assert!(other.is_infinite());
+        // The other one later; with seconds between them; and who stands does not come.
+        assert!(meet(25.0, 10.0, 7.0).0.is_infinite() && meet(25.0, 10.0, 7.0).1.is_finite());
+        assert_eq!(meet(-10.0, 8.0, 10.0), (f64::INFINITY, f64::INFINITY));
+        assert!(meet(20.0, 8.0, 0.0).0.is_infinite());
+        // At the line it waits.
+        assert_eq!(meet(38.0, 0.0, 9.0).0, 0.0);
+    }
+
+    #[test]
+    fn signs_and_lights_decide_before_that() {
+        let (own, other) = (car((20.0, 0.0), WEST, 8.0), car((52.0, -30.0), SOUTH, 10.0));
+        let signed = crossing(&[4]);
+        let (west, south) = speeds(&signed, &Lights::default(), own, other);
+        assert!(west.is_infinite() && south.is_finite());
+        // Who has red does not come.
+        let lights = Lights {
+            by_lane: vec![(LaneId(5), LightState::Red, None)],
+        };
+        let map = crossing(&[]);
+        let west = |lights: &Lights| speeds(&map, lights, own, other).0;
+        assert!(west(&Lights::default()).is_finite() && west(&lights).is_infinite());
+    }
+
+    #[test]
+    fn who_is_inside_goes_on_and_who_turns_left_waits() {
+        let map = crossing(&[]);
+        let none = Lights::default();
+        let inside = speeds(
+            &map,
+            &none,
+            car((42.0, 0.0), WEST, 4.0),
+            car((52.0, -18.0), SOUTH, 8.0),
+        );
+        assert!(inside.0.is_infinite() && inside.1.is_finite());
+        // On the lane that turns left, where it crosses the oncoming lane.
+        let turning = car((44.0, 0.7), 0.17, 4.0);
+        let (own, other) = speeds(&map, &none, turning, car((75.0, 5.0), EAST, 9.0));
+        assert!(own.is_finite() && other.is_infinite(), "{own} {other}");
+        // Before the junction it may still drive straight on.
+        let undecided = car((36.0, 0.0), WEST, 5.0);
+        let (own, other) = speeds(&map, &none, undecided, car((75.0, 5.0), EAST, 9.0));
+        assert!(own.is_infinite() && other.is_infinite());
+    }
+
+    #[test]
+    fn one_behind_the_other_is_no_matter_of_right_of_way() {
+        let map = crossing(&[]);
+        let follow = [car((20.0, 0.0), WEST, 8.0), car((32.0, 0.0), WEST, 6.0)];
+        let (own, other) = speeds(&map, &Lights::default(), follow[0], follow[1]);
+        assert!(own.is_infinite() && other.is_infinite());
+        // Away from junctions there is none.
+        let beyond = car((70.0, 0.0), WEST, 8.0);
+        let (own, other) = speeds(
+            &map,
+            &Lights::default(),
+            beyond,
+            car((90.0, 5.0), EAST, 8.0),
+        );
+        assert!(own.is_infinite() && other.is_infinite());
+    }
+}
