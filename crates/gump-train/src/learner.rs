@@ -8,7 +8,7 @@ use gump_kernels::Operands;
 use gump_model::checkpoint::StorageType;
 use gump_model::{Network, checkpoint};
 use gump_nn::NnError;
-use gump_nn::optimizer::{AdamW, move_average};
+use gump_nn::optimizer::{AdamW, OptimizerConfig, move_average};
 use gump_nn::parameters::Parameters;
 
 use super::config::TrainConfig;
@@ -159,22 +159,50 @@ impl TrainState {
         gradients: &Gradients,
         config: &TrainConfig,
     ) -> Result<f64, TrainError> {
-        let rate = config.optimizer.rate(self.step, config.steps);
-        let parameters = self.network.parameters();
-        let norm = self
-            .optimizer
-            .step(parameters, gradients, &config.optimizer, rate)?;
-        self.step += 1;
-        if let (Some(average), Some(ema)) = (&self.average, config.ema) {
-            let t = self.step as f64;
-            let share = ema.min((1.0 + t) / (10.0 + t));
-            move_average(average.parameters(), parameters, share)?;
-        }
+        let average = self.average.as_ref().map(Network::parameters);
+        let update = Update {
+            parameters: self.network.parameters(),
+            average: average.zip(config.ema),
+            optimizer: &config.optimizer,
+            steps: config.steps,
+        };
+        let (norm, _) = update.learn(&mut self.optimizer, &mut self.step, gradients)?;
         Ok(norm)
     }
 }
 
-/// All tensors of a network, each name after a prefix.
+/// A step of a run, whatever it trains.
+pub(crate) struct Update<'a> {
+    pub(crate) parameters: &'a Parameters,
+    /// The moving average, and the share of it that stays in a step.
+    pub(crate) average: Option<(&'a Parameters, f64)>,
+    pub(crate) optimizer: &'a OptimizerConfig,
+    /// Length of the run.
+    pub(crate) steps: usize,
+}
+
+impl Update<'_> {
+    /// Moves the parameters along the gradients and the average towards them, and counts the step.
+    /// Returns the norm of the gradients before clipping, and the learning rate.
+    pub(crate) fn learn(
+        &self,
+        state: &mut AdamW,
+        step: &mut usize,
+        gradients: &Gradients,
+    ) -> Result<(f64, f64), TrainError> {
+        let rate = self.optimizer.rate(*step, self.steps);
+        let norm = state.step(self.parameters, gradients, self.optimizer, rate)?;
+        *step += 1;
+        if let Some((average, stays)) = self.average {
+            // At first the average is of the steps done so far.
+            let t = *step as f64;
+            let share = stays.min((1.0 + t) / (10.0 + t));
+            move_average(average, self.parameters, share)?;
+        }
+        Ok((norm, rate))
+    }
+}
+
 fn named(prefix: &str, network: &Network) -> BTreeMap<String, Tensor> {
     let all = network.parameters().all();
     all.map(|(name, var)| (format!("{prefix}{name}"), var.as_tensor().clone()))

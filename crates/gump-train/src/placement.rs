@@ -17,7 +17,7 @@ use gump_kernels::Operands;
 use gump_model::checkpoint::{self, StorageType};
 use gump_model::placement::{PlacementConfig, PlacementNetwork};
 use gump_nn::NnError;
-use gump_nn::optimizer::{AdamW, OptimizerConfig, move_average};
+use gump_nn::optimizer::{AdamW, OptimizerConfig};
 use gump_nn::parameters::Parameters;
 use gump_scene::{Agent, AgentKind, Scenario, Seed};
 use rand::Rng as _;
@@ -26,6 +26,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
+use crate::learner::Update;
 use crate::scenes::ScenarioSource;
 
 /// Maximum number of scenes tried for a sample: more mean that hardly any has two vehicles on roads.
@@ -277,15 +278,14 @@ impl PlacementTrainer {
                 gradients.insert(name.to_owned(), sum);
             }
         }
-        let rate = self.config.optimizer.rate(self.step, self.config.steps);
-        let parameters = self.trained.parameters();
-        let gradient_norm =
-            self.optimizer
-                .step(parameters, &gradients, &self.config.optimizer, rate)?;
-        self.step += 1;
-        let t = self.step as f64;
-        let share = self.config.ema.min((1.0 + t) / (10.0 + t));
-        move_average(self.average.parameters(), parameters, share)?;
+        let update = Update {
+            parameters: self.trained.parameters(),
+            average: Some((self.average.parameters(), self.config.ema)),
+            optimizer: &self.config.optimizer,
+            steps: self.config.steps,
+        };
+        let (gradient_norm, rate) =
+            update.learn(&mut self.optimizer, &mut self.step, &gradients)?;
         Ok(PlacementStep {
             step: self.step,
             loss,

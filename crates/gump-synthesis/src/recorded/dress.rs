@@ -32,7 +32,7 @@ const WIDE_CAR_PARKS: f64 = 0.4;
 /// Share of the kinds of streets with parking on which vehicles park within the lanes, how wide these
 /// are then, metres, and the highest limit before drivers hurry, m/s. Recorded lanes beside parked
 /// vehicles lie 5 m apart (median), and they are passed at 3 to 9 m/s.
-const IN_LANE: f64 = 0.6;
+const IN_LANE: f64 = 0.8;
 const WIDE_LANES: std::ops::Range<f64> = 4.6..7.2;
 const STREET_SPEED: f64 = 10.0;
 /// Aisles leave their road within this of a right angle, radians.
@@ -44,7 +44,7 @@ pub(crate) fn dress(plan: &mut Plan, extent: f64, rng: &mut Rng) {
     if rng.random_bool(WIDE_CAR_PARKS) {
         add_some(plan, extent, 1, add_wide_car_park, rng);
     }
-    let n_side = rng.random_range(1..=6);
+    let n_side = rng.random_range(0..=4);
     add_some(plan, extent, n_side, add_side_road, rng);
     let n_parks = rng.random_range(1..=6);
     add_some(plan, extent, n_parks, add_car_park, rng);
@@ -52,7 +52,7 @@ pub(crate) fn dress(plan: &mut Plan, extent: f64, rng: &mut Rng) {
     add_some(plan, extent, n_yards, add_yard, rng);
     allow_parking(plan, rng);
     // Traffic is faster than plain plans have it, on wide roads above all.
-    let haste: f64 = rng.random_range(1.3..2.0);
+    let haste: f64 = rng.random_range(1.4..2.1);
     for road in plan.roads.iter_mut().filter(|road| road.speed_limit > 7.0) {
         road.speed_limit *= if road.forward > 1 {
             haste

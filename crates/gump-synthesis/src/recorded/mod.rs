@@ -36,15 +36,15 @@ use crate::{RoadFamily, SynthesisConfig};
 /// Weights of the families: recordings are made in towns, rarely on motorways. Fitted by hand in
 /// several rounds, towards roads as fast as recorded ones.
 const FAMILIES: [(RoadFamily, u32); 9] = [
-    (RoadFamily::SignalizedCrossing, 12),
-    (RoadFamily::StopCrossing, 16),
-    (RoadFamily::TeeJunction, 8),
+    (RoadFamily::SignalizedCrossing, 8),
+    (RoadFamily::StopCrossing, 12),
+    (RoadFamily::TeeJunction, 6),
     (RoadFamily::Roundabout, 2),
-    (RoadFamily::Arterial, 44),
-    (RoadFamily::CurvedRoad, 8),
-    (RoadFamily::OnRamp, 22),
-    (RoadFamily::MidBlockCrosswalk, 8),
-    (RoadFamily::Grid, 10),
+    (RoadFamily::Arterial, 60),
+    (RoadFamily::CurvedRoad, 14),
+    (RoadFamily::OnRamp, 16),
+    (RoadFamily::MidBlockCrosswalk, 6),
+    (RoadFamily::Grid, 8),
 ];
 // Some formats state no limits, signs or lights (docs/decisions/0014-unknown-inputs.md). The shares
 // are chosen by hand, so that a network meets both.
@@ -58,7 +58,7 @@ const NO_LIGHTS: f64 = 0.3;
 const UNMAPPED_CAR_PARKS: f64 = 0.7;
 /// Share of these whose road edges run across the mouths of car parks and yards, as they do across
 /// driveways in recordings.
-const CLOSED_MOUTHS: f64 = 0.75;
+const CLOSED_MOUTHS: f64 = 0.6;
 /// Roads with a higher limit are wide and carry more traffic, m/s. Chosen by hand.
 const WIDE_ROAD_SPEED: f64 = 15.0;
 /// Metres from the centre of the scene within which the ego is chosen: with the
@@ -100,7 +100,7 @@ pub(crate) fn draw_scenario(
     let mut plan = draw_plan(family, config.extent_m, &mut rng);
     dress::dress(&mut plan, config.extent_m, &mut rng);
     let (mut network, trimmed) = Network::roads(&plan, &mut rng);
-    let n_lots = rng.random_range(1..=11);
+    let n_lots = rng.random_range(3..=14);
     network.lay_lots(&plan, &trimmed, n_lots, 1..=6, &mut rng);
     let driveways = driveways::lay(&mut network, &plan, &trimmed, &mut rng);
     bumps::lay(&mut network, &plan, &trimmed, &mut rng);
@@ -169,7 +169,7 @@ fn draw_demand(
         .lanes
         .iter()
         .any(|lane| lane.speed_limit > WIDE_ROAD_SPEED);
-    let busy = if has_wide_roads { 1.5 } else { 1.0 };
+    let busy = if has_wide_roads { 1.5 } else { 0.65 };
     let moving = draw_skewed(&config.vehicles, 1.3, busy * config.density, rng).clamp(1, most);
     // How busy people and parking are goes together.
     let bustle = rng.random_range(0.0_f64..1.0);

@@ -111,7 +111,7 @@ fn parked(network: &Network, rng: &mut Rng) -> Vec<Standing> {
 
 /// The share of places that are taken; rows are mostly nearly full, or nearly empty.
 fn draw_fill(rng: &mut Rng) -> f64 {
-    let part: f64 = rng.random_range(0.0_f64..1.0).powf(0.6);
+    let part: f64 = rng.random_range(0.0_f64..1.0).powf(0.4);
     0.1 + 0.88 * (0.55 - (std::f64::consts::PI * part).cos() / 2.0).clamp(0.0, 1.0)
 }
 

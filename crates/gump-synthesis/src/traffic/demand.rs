@@ -60,10 +60,13 @@ pub(crate) struct Standing {
     pub(crate) pose: Pose,
 }
 
-/// Weight of a turn into a yard or car park relative to one into another road. Chosen by hand:
-/// about as many vehicles leave the road as in recordings
+/// Weight of a turn into a yard or car park relative to one into another road, in plain scenes and in
+/// those like recorded ones. Chosen by hand: about as many vehicles leave the road as in recordings
 /// (docs/results/0025-where-realism-is-lost.md).
-const INTO_YARDS: f64 = 0.5;
+const INTO_YARDS: [f64; 2] = [0.5, 0.3];
+/// The same for turns into slower roads in scenes like recorded ones: the square of how much slower,
+/// and at least this. Chosen by hand: most of the traffic of wide roads stays on them.
+const LEAST_TURNS: f64 = 0.15;
 /// Cyclists of scenes like recorded ones ride at most this far from the lane's centre, metres: in wide
 /// lanes vehicles park beside them.
 const BICYCLE_ASIDE: f64 = 1.35;
@@ -340,11 +343,16 @@ impl TrafficSimulation<'_> {
                     Turn::Right => 0.25,
                     Turn::Left => 0.25,
                 };
-                let leaves_road = lanes[next]
-                    .successors
-                    .first()
-                    .is_some_and(|&beyond| lanes[beyond].speed_limit < CAR_PARK_SPEED);
-                let turn = if leaves_road { turn * INTO_YARDS } else { turn };
+                let beyond = lanes[next].successors.first();
+                let limit = beyond.map_or(here.speed_limit, |&beyond| lanes[beyond].speed_limit);
+                let is_real = self.demand.scenery.is_real;
+                let turn = match limit < CAR_PARK_SPEED {
+                    true => turn * INTO_YARDS[usize::from(is_real)],
+                    false if is_real => {
+                        turn * (limit / here.speed_limit).powi(2).clamp(LEAST_TURNS, 1.0)
+                    }
+                    false => turn,
+                };
                 if fits { turn } else { 1e-6 }
             };
             let total: f64 = here.successors.iter().map(weight).sum();

@@ -8,8 +8,11 @@ use super::driver::Leader;
 use super::vehicle::{LaneChange, Vehicle};
 use crate::network::LaneIdx;
 
-/// Shortest lane that is left after a change, metres. Chosen by hand.
-const ROOM_AFTER: f64 = 15.0;
+/// Shortest lane that is left after a change, metres, and how long a change takes that need not be
+/// made: seconds, and more of them per second of headway. In plain scenes, and in those like recorded
+/// ones, where minor roads cut lanes into short pieces. Chosen by hand.
+const ROOM_AFTER: [f64; 2] = [40.0, 12.0];
+const TAKES_S: [(f64, f64); 2] = [(3.4, 0.8), (2.6, 0.6)];
 /// Deceleration that a change may impose on the vehicle behind, m/s²: a comfortable one. Chosen by
 /// hand.
 const IMPOSED_BRAKING: f64 = 2.0;
@@ -61,7 +64,7 @@ impl TrafficSimulation<'_> {
             || target.is_dead_end()
             || vehicle.speed < 3.0 && !must
             || vehicle.s < vehicle.length() + 2.0
-            || ends && left < length + ROOM_AFTER + 25.0
+            || ends && left < length + ROOM_AFTER[self.is_real()]
             || !vehicle.claims.is_empty() && !must
             || must && left < 0.7 * length
         {
@@ -112,7 +115,8 @@ impl TrafficSimulation<'_> {
         let seconds = if must {
             3.2
         } else {
-            3.4 + 0.8 * vehicle.driver.headway
+            let (least, per_headway) = TAKES_S[self.is_real()];
+            least + per_headway * vehicle.driver.headway
         };
         (vehicle.speed.max(6.0) * seconds).min(70.0)
     }

@@ -14,7 +14,7 @@ use gump_model::relative::grid::FIELDS;
 use gump_model::relative::sample::{Sample, SampleConfig, draw};
 use gump_model::relative::{RelativeConfig, RelativeNetwork};
 use gump_nn::ops::Deferred;
-use gump_nn::optimizer::{AdamW, OptimizerConfig, move_average};
+use gump_nn::optimizer::{AdamW, OptimizerConfig};
 use gump_nn::parameters::Parameters;
 use gump_nn::{Gradients, NnError};
 use gump_scene::{Scenario, Seed};
@@ -22,6 +22,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
+use crate::learner::Update;
 use crate::relative::drives::{NetworkDriver, RelativeDrives};
 use crate::relative::rewards::{Group, Judged, RelativeRewards};
 use crate::scenes::ScenarioSource;
@@ -390,15 +391,14 @@ impl RelativeTrainer {
         });
         let sums: Vec<_> = sums.collect::<Result<_, TrainError>>()?;
         let gradients: Gradients = sums.into_iter().flatten().collect();
-        let rate = self.config.optimizer.rate(self.step, self.config.steps);
-        let parameters = self.trained.parameters();
-        let gradient_norm =
-            self.optimizer
-                .step(parameters, &gradients, &self.config.optimizer, rate)?;
-        self.step += 1;
-        let t = self.step as f64;
-        let share = self.config.ema.min((1.0 + t) / (10.0 + t));
-        move_average(self.average.parameters(), parameters, share)?;
+        let update = Update {
+            parameters: self.trained.parameters(),
+            average: Some((self.average.parameters(), self.config.ema)),
+            optimizer: &self.config.optimizer,
+            steps: self.config.steps,
+        };
+        let (gradient_norm, rate) =
+            update.learn(&mut self.optimizer, &mut self.step, &gradients)?;
         Ok(RelativeStep {
             step: self.step,
             loss,
