@@ -26,7 +26,7 @@ use gump_model::relative::grid::dequantize;
 use gump_model::relative::map::VectorMap;
 use gump_model::relative::sample::{Track, TrackDriver};
 use gump_model::relative::{RelativeNetwork, RelativeWeights};
-use gump_scene::{AgentKind, LightState, MapGraph, Seed};
+use gump_scene::{AgentKind, MapGraph, Seed};
 use rand::Rng as _;
 use serde::{Deserialize, Serialize};
 
@@ -47,11 +47,11 @@ const PARKED_M: f64 = 0.5;
 /// ... off lanes: farther than this from their centre lines, metres. Both were chosen by hand. On a
 /// lane it is parked where nothing could have held it.
 const OFF_LANE_M: f64 = 1.5;
-/// A vehicle waits at red, or for others at a stop sign, if its log moves no farther than this in the
-/// next step, metres, it is itself as near to its log, ...
+/// A vehicle waits in a queue if its log moves no farther than this in a step, metres, it is itself as
+/// near to its log, ...
 const WAITS_M: f64 = 0.2;
-/// ... and the line is ahead of it, this far at most, and this far aside, metres. All were chosen by
-/// hand.
+/// ... and the line of a light or a stop sign is ahead of it, this far at most, and this far aside,
+/// metres. All were chosen by hand.
 const LINE_AHEAD_M: f64 = 60.0;
 const LINE_ASIDE_M: f64 = 6.0;
 /// A move with a fault is drawn again so many times. Chosen by hand.
@@ -239,10 +239,11 @@ impl TrackDriver for NetworkDriver {
                 .collect();
             let seed = seed.fork(t as u64);
             if let Some(lane_map) = &lane_map {
-                let lines: Vec<Pose> = red_lanes(lights, streets).chain(signs.clone()).collect();
-                let waits = |a: usize, now: &Shown| {
-                    tracks[a].body.kind == AgentKind::Vehicle
-                        && waits(now.pose, [logs[a][t], logs[a][t + 1]], &lines)
+                let lines: Vec<Pose> = lit_lanes(lights, streets).chain(signs.clone()).collect();
+                let log = |a: usize| [logs[a][t - 1], logs[a][t], logs[a][t + 1]];
+                let queues = |a: usize, now: &Shown| match tracks[a].body.kind {
+                    AgentKind::Vehicle => queues(now.pose, log(a), &lines),
+                    _ => None,
                 };
                 let has_room = |i: usize| look(map, lights, &agents, i).has_room(&agents[i]);
                 let ways = |now: &Shown| match now.body.kind {
@@ -254,19 +255,23 @@ impl TrackDriver for NetworkDriver {
                     let others = ways.iter().enumerate().filter(|(j, _)| *j != i);
                     yielding_speed(&ways[i], &others.map(|(_, way)| &way[..]))
                 };
-                let mut stay = Vec::new();
+                let mut given = Vec::new();
                 let mut roads = Vec::new();
                 for (i, (&a, now)) in here.iter().zip(&agents).enumerate() {
-                    let holds = stays[a] || waits(a, now);
-                    let road = Road::ahead_of(now, holds, streets, lights).yielding(yields(i));
+                    let step = match stays[a] {
+                        true => Some(Pose::IDENTITY),
+                        false => queues(a, now),
+                    };
+                    let road = Road::ahead_of(now, step.is_some(), streets, lights);
+                    let road = road.yielding(yields(i));
                     let is_left = || stood[a] && road.is_beside_nothing() && has_room(i);
-                    stay.push(holds || is_left());
+                    given.push(step.or_else(|| is_left().then_some(Pose::IDENTITY)));
                     roads.push(road);
                 }
-                let crowd = (&agents[..], &stay[..]);
-                let fault = |i: usize, step: &Pose| match stay[i] {
-                    true => 0.0,
-                    false => roads[i].fault(&agents[i], step, || has_room(i)),
+                let crowd = (&agents[..], &given[..]);
+                let fault = |i: usize, step: &Pose| match given[i] {
+                    Some(_) => 0.0,
+                    None => roads[i].fault(&agents[i], step, || has_room(i)),
                 };
                 let ground = (lane_map, &fault as &Fault<'_>);
                 let moves = self.moves_by_the_rules(crowd, ground, &hidden, seed, &mut room);
@@ -299,10 +304,10 @@ impl TrackDriver for NetworkDriver {
 
 impl NetworkDriver {
     /// A move of every agent in its own frame, redrawn where it has a fault and where the rules
-    /// forbid it; marked agents stay.
+    /// forbid it; some are given.
     fn moves_by_the_rules(
         &self,
-        (agents, stay): (&[Shown], &[bool]),
+        (agents, given): (&[Shown], &[Option<Pose>]),
         (lane_map, fault): (&LaneMap, &Fault<'_>),
         hidden: &[f32],
         seed: Seed,
@@ -322,11 +327,10 @@ impl NetworkDriver {
             let of_draw = seed.fork(attempt as u64);
             let streams: Vec<Seed> = who.iter().map(|&i| of_draw.fork(i as u64)).collect();
             let bins = self.engine.decide(&rows, &streams, draw, room);
-            let drawn = who.iter().zip(bins).map(|(&i, bins)| match stay[i] {
-                true => Pose::IDENTITY,
-                false => dequantize(bins),
-            });
-            drawn.collect()
+            let drawn = who.iter().zip(bins);
+            drawn
+                .map(|(&i, bins)| given[i].unwrap_or_else(|| dequantize(bins)))
+                .collect()
         };
         let all: Vec<usize> = (0..agents.len()).collect();
         let mut moves = drawn(&all, 0);
@@ -384,14 +388,11 @@ fn stands_throughout(track: &Track) -> bool {
     track.body.kind == AgentKind::Vehicle && logged.all(stays)
 }
 
-/// Where lanes at red start.
-fn red_lanes(lights: &Lights, streets: &MapGraph) -> impl Iterator<Item = Pose> {
-    let red = lights
-        .by_lane
-        .iter()
-        .filter(|(_, state, _)| *state == LightState::Red);
+/// Where lanes with lights start.
+fn lit_lanes(lights: &Lights, streets: &MapGraph) -> impl Iterator<Item = Pose> {
     let start = |id| Some(streets.lane(id)?.centerline.pose_at(0.0));
-    red.filter_map(move |(id, _, _)| start(*id))
+    let lit = lights.by_lane.iter();
+    lit.filter_map(move |(id, ..)| start(*id))
 }
 
 /// The logged poses of a track.
@@ -400,12 +401,15 @@ fn log_of(track: &Track) -> Vec<Option<Pose>> {
     states.map(|state| Some((*state)?.logged)).collect()
 }
 
-/// Whether an agent that is `here` stands where its log does, `now` and in the next frame, and a line
-/// ahead, where a lane at red starts or a stop sign holds, is the reason.
-pub(super) fn waits(here: Pose, [now, next]: [Option<Pose>; 2], lines: &[Pose]) -> bool {
-    let (Some(now), Some(next)) = (now, next) else {
-        return false;
-    };
+/// The move of an agent that is `here` and waits in a queue: where its log stands, `now`, behind a line
+/// ahead, at which a light or a stop sign holds. It stays as long as its log does and starts with it. If
+/// it only stayed, it would start later than its log, or as soon, and never sooner; and that is what it
+/// would learn. `None` for others.
+pub(super) fn queues(
+    here: Pose,
+    [before, now, next]: [Option<Pose>; 3],
+    lines: &[Pose],
+) -> Option<Pose> {
     let near = |a: Pose, b: Pose| a.position.distance(b.position) < WAITS_M;
     let ahead = |line: &Pose| {
         let local = here.inverse() * *line;
@@ -413,7 +417,14 @@ pub(super) fn waits(here: Pose, [now, next]: [Option<Pose>; 2], lines: &[Pose]) 
             && local.position.y.abs() < LINE_ASIDE_M
             && local.heading.cos() > 0.7
     };
-    near(now, next) && near(here, now) && lines.iter().any(ahead)
+    let (now, next) = (now?, next?);
+    let stays = near(now, next);
+    let stood = before.is_some_and(|before| near(before, now));
+    let waits = near(here, now) && (stays || stood) && lines.iter().any(ahead);
+    waits.then(|| match stays {
+        true => Pose::IDENTITY,
+        false => here.inverse() * next,
+    })
 }
 
 /// Distance between two poses, metres.

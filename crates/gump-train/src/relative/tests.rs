@@ -282,15 +282,16 @@ fn parked_vehicles_stay_where_the_log_has_them() {
     );
 }
 
-/// A random network does not wait at red; a vehicle whose log does is held there.
+/// A random network does not wait at lights; a vehicle whose log does is held there. At the end of a road
+/// it drives on.
 #[test]
-fn vehicles_that_wait_at_red_do_not_learn_to_start() {
+fn vehicles_that_wait_at_lights_do_not_learn_to_start() {
     let driver = under_the_rules();
     let starts = |light: &str| {
         let text = format!(
             "lane 1: 0,0 40,0
-             lane 2: 40,0 200,0
-             light 2 {light}: 40,0
+             lane 2: 40,0 55,0
+             {light}
              ego vehicle 0: 30,0"
         );
         let scenario = fixture::scenario(&text).unwrap();
@@ -298,27 +299,31 @@ fn vehicles_that_wait_at_red_do_not_learn_to_start() {
         let own = sample.targets.iter().skip(1);
         own.filter(|t| t.bins[0] != grid::STANDS).count()
     };
-    assert_eq!(starts("red"), 0);
-    assert!(starts("green") > 0);
+    assert_eq!(starts("light 2 red: 40,0"), 0);
+    assert_eq!(starts("light 2 green: 40,0"), 0);
+    assert!(starts("") > 0);
 }
 
 #[test]
-fn who_waits_at_red_stands_where_its_log_does() {
+fn who_waits_in_a_queue_stands_and_starts_where_its_log_does() {
     let at = |x: f64| Pose::new(x, 0.0, 0.0);
-    let waits = |here, now, next, line| {
-        drives::waits(at(here), [Some(at(now)), Some(at(next))], &[at(line)])
+    let moves = |here, [before, now, next]: [f64; 3], line: f64| {
+        let log = [before, now, next].map(|x| Some(at(x)));
+        let step = drives::queues(at(here), log, &[at(line)])?;
+        Some((step.position.x * 1e3).round() / 1e3)
     };
-    assert!(waits(30.0, 30.0, 30.0, 35.0));
-    // Its log goes on, or comes to where the vehicle is already on its way.
-    assert!(!waits(30.0, 30.0, 31.0, 35.0));
-    assert!(!waits(30.0, 27.0, 30.0, 35.0));
-    // It is not where its log is, the light is behind it, far away, or of another direction.
-    assert!(!waits(29.0, 30.0, 30.0, 35.0));
-    assert!(!waits(30.0, 30.0, 30.0, 25.0));
-    assert!(!waits(30.0, 30.0, 30.0, 100.0));
+    assert_eq!(moves(30.0, [30.0, 30.0, 30.0], 35.0), Some(0.0));
+    // It starts with its log, from where it is; on its way, or when it comes, it moves by itself.
+    assert_eq!(moves(30.1, [30.0, 30.0, 31.0], 35.0), Some(0.9));
+    assert_eq!(moves(30.0, [29.0, 30.0, 31.0], 35.0), None);
+    assert_eq!(moves(30.0, [24.0, 27.0, 30.0], 35.0), None);
+    // It is not where its log is, the line is behind it, far away, or of another direction.
+    assert_eq!(moves(29.0, [30.0, 30.0, 30.0], 35.0), None);
+    assert_eq!(moves(30.0, [30.0, 30.0, 30.0], 25.0), None);
+    assert_eq!(moves(30.0, [30.0, 30.0, 30.0], 100.0), None);
     let (here, aside) = (at(30.0), Pose::new(35.0, 0.0, 1.5));
-    assert!(!drives::waits(here, [Some(here); 2], &[aside]));
-    assert!(!drives::waits(here, [Some(here), None], &[at(35.0)]));
+    assert!(drives::queues(here, [Some(here); 3], &[aside]).is_none());
+    assert!(drives::queues(here, [Some(here), Some(here), None], &[at(35.0)]).is_none());
 }
 
 /// A crowd joins samples under the rules, in which nobody stands inside another at first.
