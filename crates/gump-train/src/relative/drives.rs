@@ -239,10 +239,11 @@ impl TrackDriver for NetworkDriver {
                 .collect();
             let seed = seed.fork(t as u64);
             if let Some(lane_map) = &lane_map {
-                let lines: Vec<Pose> = lit_lanes(lights, streets).chain(signs.clone()).collect();
+                let signs = signs.iter().copied();
+                let lines: Vec<Pose> = lit_lanes(lights, streets).chain(signs).collect();
                 let log = |a: usize| [logs[a][t - 1], logs[a][t], logs[a][t + 1]];
-                let queues = |a: usize, now: &Shown| match tracks[a].body.kind {
-                    AgentKind::Vehicle => queues(now.pose, log(a), &lines),
+                let queued = |a: usize, now: &Shown| match tracks[a].body.kind {
+                    AgentKind::Vehicle => queued_move(now.pose, log(a), &lines),
                     _ => None,
                 };
                 let has_room = |i: usize| look(map, lights, &agents, i).has_room(&agents[i]);
@@ -260,12 +261,14 @@ impl TrackDriver for NetworkDriver {
                 for (i, (&a, now)) in here.iter().zip(&agents).enumerate() {
                     let step = match stays[a] {
                         true => Some(Pose::IDENTITY),
-                        false => queues(a, now),
+                        false => queued(a, now),
                     };
-                    let road = Road::ahead_of(now, step.is_some(), streets, lights);
-                    let road = road.yielding(yields(i));
-                    let is_left = || stood[a] && road.is_beside_nothing() && has_room(i);
-                    given.push(step.or_else(|| is_left().then_some(Pose::IDENTITY)));
+                    let mut road = Road::ahead_of(now, step.is_some(), streets, lights);
+                    if step.is_none() {
+                        road = road.yielding(yields(i));
+                    }
+                    let is_parked = || stood[a] && road.is_away_from_junctions() && has_room(i);
+                    given.push(step.or_else(|| is_parked().then_some(Pose::IDENTITY)));
                     roads.push(road);
                 }
                 let crowd = (&agents[..], &given[..]);
@@ -405,7 +408,7 @@ fn log_of(track: &Track) -> Vec<Option<Pose>> {
 /// ahead, at which a light or a stop sign holds. It stays as long as its log does and starts with it. If
 /// it only stayed, it would start later than its log, or as soon, and never sooner; and that is what it
 /// would learn. `None` for others.
-pub(super) fn queues(
+pub(super) fn queued_move(
     here: Pose,
     [before, now, next]: [Option<Pose>; 3],
     lines: &[Pose],

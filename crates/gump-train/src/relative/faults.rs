@@ -3,9 +3,10 @@
 //! In drives under the rules the network's own motion is its target. What is judged here is the
 //! speed: rules prefer slow draws, so that vehicles would slow down on free roads, more with each
 //! update; and a vehicle that comes to a bend too fast leaves the road whatever is drawn then. One
-//! that comes to a red light too fast runs it. And the direction at junctions: who turns neither way
-//! where the road ends drives off it. Queues would leave later with each update, too: who stands and has
-//! room is drawn again, which makes it start sooner or later.
+//! that comes to a red light or a stop sign too fast runs it, and one that comes to a junction before
+//! others takes their way (`right_of_way`). And the direction at junctions: who turns neither way where
+//! the road ends drives off it. Queues would leave later with each update, too: who stands and has room
+//! is drawn again, which makes it start sooner or later.
 
 use std::cell::OnceCell;
 use std::f64::consts::FRAC_PI_6;
@@ -134,9 +135,9 @@ impl<'a> Road<'a> {
         }
     }
 
-    /// Whether a vehicle that stands here for long is parked, unless an agent is in its way: no
-    /// junction, stop sign or light is near.
-    pub(super) fn is_beside_nothing(&self) -> bool {
+    /// Whether no junction, stop sign or light is near that could hold a vehicle here: one that stands
+    /// for long is parked, unless an agent is in its way.
+    pub(super) fn is_away_from_junctions(&self) -> bool {
         let Some((lane, at)) = self.on else {
             return false;
         };
@@ -416,7 +417,7 @@ mod tests {
         };
         let left = |x: f64, lights: &Lights| {
             let now = Shown::first(BODY, Pose::new(x, 0.0, 0.0), dvec2(0.0, 0.0));
-            Road::ahead_of(&now, false, &map, lights).is_beside_nothing()
+            Road::ahead_of(&now, false, &map, lights).is_away_from_junctions()
         };
         let none = Lights::default();
         assert!(left(120.0, &none) && left(10.0, &none) && !left(40.0, &none));

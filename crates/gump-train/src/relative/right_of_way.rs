@@ -32,8 +32,8 @@ const MOVES_MPS: f64 = 1.0;
 /// place, metres.
 const STARTS_MPS2: f64 = 1.2;
 const BEFORE_M: f64 = 1.0;
-/// A course that turns by more than this turns, radians; it is towards another that comes from the
-/// opposite direction within this.
+/// A course turns if its direction changes by more than this, radians, and is opposite to another if they
+/// differ from half a turn by less than this, radians.
 const TURNS: f64 = 0.5;
 const OPPOSITE: f64 = 0.8;
 
@@ -154,8 +154,12 @@ impl Course {
         if (self.line_m.is_none() && !self.is_inside) || stays_out || other.speed() < MOVES_MPS {
             return None;
         }
-        let meeting = self.meets(other)?;
         let half = 0.5 * (self.now.body.length + other.now.body.length);
+        let apart = self.now.pose.position.distance(other.now.pose.position);
+        if apart > self.reach(half) + other.reach(half) + self.beside(other) {
+            return None;
+        }
+        let meeting = self.meets(other)?;
         let mine = self.times(meeting.own, half);
         let its = other.times(meeting.other, half);
         let is_soon = mine.0 < SOON_S && its.0 < SOON_S;
@@ -204,9 +208,23 @@ impl Course {
         (until(from - half), until(to + half))
     }
 
+    /// A place farther ahead than this is not reached soon, metres.
+    fn reach(&self, half: f64) -> f64 {
+        let driven = match self.speed() {
+            speed if speed < MOVES_MPS => 0.5 * STARTS_MPS2 * SOON_S * SOON_S,
+            speed => speed * SOON_S,
+        };
+        driven + half
+    }
+
+    /// Two courses meet where they are nearer than this, metres.
+    fn beside(&self, other: &Self) -> f64 {
+        0.5 * (self.now.body.width + other.now.body.width) + BESIDE_M
+    }
+
     /// The first stretch on which two courses are beside or on each other, if they come from apart.
     fn meets(&self, other: &Self) -> Option<Meeting> {
-        let near = 0.5 * (self.now.body.width + other.now.body.width) + BESIDE_M;
+        let near = self.beside(other);
         let hits = |point: &DVec2| {
             let distance = |(j, of): (usize, &DVec2)| (of.distance_squared(*point), j);
             let nearest = other.points.iter().enumerate().map(distance);

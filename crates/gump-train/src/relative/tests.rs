@@ -309,7 +309,7 @@ fn who_waits_in_a_queue_stands_and_starts_where_its_log_does() {
     let at = |x: f64| Pose::new(x, 0.0, 0.0);
     let moves = |here, [before, now, next]: [f64; 3], line: f64| {
         let log = [before, now, next].map(|x| Some(at(x)));
-        let step = drives::queues(at(here), log, &[at(line)])?;
+        let step = drives::queued_move(at(here), log, &[at(line)])?;
         Some((step.position.x * 1e3).round() / 1e3)
     };
     assert_eq!(moves(30.0, [30.0, 30.0, 30.0], 35.0), Some(0.0));
@@ -322,8 +322,8 @@ fn who_waits_in_a_queue_stands_and_starts_where_its_log_does() {
     assert_eq!(moves(30.0, [30.0, 30.0, 30.0], 25.0), None);
     assert_eq!(moves(30.0, [30.0, 30.0, 30.0], 100.0), None);
     let (here, aside) = (at(30.0), Pose::new(35.0, 0.0, 1.5));
-    assert!(drives::queues(here, [Some(here); 3], &[aside]).is_none());
-    assert!(drives::queues(here, [Some(here), Some(here), None], &[at(35.0)]).is_none());
+    assert!(drives::queued_move(here, [Some(here); 3], &[aside]).is_none());
+    assert!(drives::queued_move(here, [Some(here), Some(here), None], &[at(35.0)]).is_none());
 }
 
 /// A crowd joins samples under the rules, in which nobody stands inside another at first.
