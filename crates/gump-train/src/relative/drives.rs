@@ -13,7 +13,7 @@
 //! stop sign, so these stay where the log has them. Nor do they say where vehicles slow down: rules
 //! prefer slow draws, which the network would learn from everywhere. Nor that no way out is left to a
 //! vehicle that comes to a bend too fast, or to a junction before others. So moves with such faults
-//! are drawn again (`faults`, `right_of_way`).
+//! are drawn again (`faults`, `right_of_way`, `pace`).
 
 use gump_engine::relative::engine::{Draw, RelativeEngine, Workspace};
 use gump_engine::relative::rules::resolve;
@@ -33,6 +33,7 @@ use serde::{Deserialize, Serialize};
 use crate::TrainError;
 use crate::relative::crowd::Crowd;
 use crate::relative::faults::{Road, sign_lines};
+use crate::relative::pace::Pace;
 use crate::relative::right_of_way::{Course, courses, yielding_speed};
 
 /// Frames that are shown as logged before the network drives: one move, so that it has seen agents
@@ -241,10 +242,9 @@ impl TrackDriver for NetworkDriver {
             if let Some(lane_map) = &lane_map {
                 let signs = signs.iter().copied();
                 let lines: Vec<Pose> = lit_lanes(lights, streets).chain(signs).collect();
-                let log = |a: usize| [logs[a][t - 1], logs[a][t], logs[a][t + 1]];
-                let queued = |a: usize, now: &Shown| match tracks[a].body.kind {
-                    AgentKind::Vehicle => queued_move(now.pose, log(a), &lines),
-                    _ => None,
+                let is_queued = |a: usize, now: &Shown| {
+                    let log = [logs[a][t], logs[a][t + 1]];
+                    now.body.kind == AgentKind::Vehicle && is_queued(now.pose, log, &lines)
                 };
                 let has_room = |i: usize| look(map, lights, &agents, i).has_room(&agents[i]);
                 let ways = |now: &Shown| match now.body.kind {
@@ -257,24 +257,34 @@ impl TrackDriver for NetworkDriver {
                     yielding_speed(&ways[i], &others.map(|(_, way)| &way[..]))
                 };
                 let mut given = Vec::new();
-                let mut roads = Vec::new();
+                let (mut roads, mut paces) = (Vec::new(), Vec::new());
                 for (i, (&a, now)) in here.iter().zip(&agents).enumerate() {
-                    let step = match stays[a] {
-                        true => Some(Pose::IDENTITY),
-                        false => queued(a, now),
-                    };
-                    let mut road = Road::ahead_of(now, step.is_some(), streets, lights);
-                    if step.is_none() {
+                    let stays = stays[a] || is_queued(a, now);
+                    let mut road = Road::ahead_of(now, stays, streets, lights);
+                    if !stays {
                         road = road.yielding(yields(i));
                     }
                     let is_parked = || stood[a] && road.is_away_from_junctions() && has_room(i);
-                    given.push(step.or_else(|| is_parked().then_some(Pose::IDENTITY)));
+                    let stays = stays || is_parked();
+                    given.push(stays.then_some(Pose::IDENTITY));
+                    paces.push(match stays {
+                        true => None,
+                        false => Pace::of_log(&logs[a], t, now, road.most()),
+                    });
                     roads.push(road);
                 }
                 let crowd = (&agents[..], &given[..]);
                 let fault = |i: usize, step: &Pose| match given[i] {
                     Some(_) => 0.0,
-                    None => roads[i].fault(&agents[i], step, || has_room(i)),
+                    None => {
+                        let (own, others) = (&agents[i], || {
+                            let others = agents.iter().enumerate().filter(|(j, _)| *j != i);
+                            others.map(|(_, other)| other)
+                        });
+                        let pace = paces[i].as_ref();
+                        let pace = pace.map_or(0.0, |pace| pace.fault(own, step, others()));
+                        roads[i].fault(own, step, || has_room(i)) + pace
+                    }
                 };
                 let ground = (lane_map, &fault as &Fault<'_>);
                 let moves = self.moves_by_the_rules(crowd, ground, &hidden, seed, &mut room);
@@ -404,15 +414,9 @@ fn log_of(track: &Track) -> Vec<Option<Pose>> {
     states.map(|state| Some((*state)?.logged)).collect()
 }
 
-/// The move of an agent that is `here` and waits in a queue: where its log stands, `now`, behind a line
-/// ahead, at which a light or a stop sign holds. It stays as long as its log does and starts with it. If
-/// it only stayed, it would start later than its log, or as soon, and never sooner; and that is what it
-/// would learn. `None` for others.
-pub(super) fn queued_move(
-    here: Pose,
-    [before, now, next]: [Option<Pose>; 3],
-    lines: &[Pose],
-) -> Option<Pose> {
+/// Whether a vehicle that is `here` waits in a queue: where its log stands, `now` and `next`, behind a
+/// line ahead, at which a light or a stop sign holds.
+pub(super) fn is_queued(here: Pose, [now, next]: [Option<Pose>; 2], lines: &[Pose]) -> bool {
     let near = |a: Pose, b: Pose| a.position.distance(b.position) < WAITS_M;
     let ahead = |line: &Pose| {
         let local = here.inverse() * *line;
@@ -420,14 +424,8 @@ pub(super) fn queued_move(
             && local.position.y.abs() < LINE_ASIDE_M
             && local.heading.cos() > 0.7
     };
-    let (now, next) = (now?, next?);
-    let stays = near(now, next);
-    let stood = before.is_some_and(|before| near(before, now));
-    let waits = near(here, now) && (stays || stood) && lines.iter().any(ahead);
-    waits.then(|| match stays {
-        true => Pose::IDENTITY,
-        false => here.inverse() * next,
-    })
+    let waits = |(now, next): (Pose, Pose)| near(here, now) && near(now, next);
+    now.zip(next).is_some_and(waits) && lines.iter().any(ahead)
 }
 
 /// Distance between two poses, metres.

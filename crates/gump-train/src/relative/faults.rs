@@ -135,6 +135,11 @@ impl<'a> Road<'a> {
         }
     }
 
+    /// The greatest speed for bends, lights, signs and vehicles with right of way, metres per second.
+    pub(super) fn most(&self) -> f64 {
+        self.most
+    }
+
     /// Whether no junction, stop sign or light is near that could hold a vehicle here: one that stands
     /// for long is parked, unless an agent is in its way.
     pub(super) fn is_away_from_junctions(&self) -> bool {

@@ -3,6 +3,7 @@
 mod crowd;
 mod drives;
 mod faults;
+mod pace;
 mod rewards;
 mod right_of_way;
 #[cfg(test)]

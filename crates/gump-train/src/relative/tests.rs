@@ -305,25 +305,19 @@ fn vehicles_that_wait_at_lights_do_not_learn_to_start() {
 }
 
 #[test]
-fn who_waits_in_a_queue_stands_and_starts_where_its_log_does() {
+fn who_waits_in_a_queue_stays_where_its_log_does() {
     let at = |x: f64| Pose::new(x, 0.0, 0.0);
-    let moves = |here, [before, now, next]: [f64; 3], line: f64| {
-        let log = [before, now, next].map(|x| Some(at(x)));
-        let step = drives::queued_move(at(here), log, &[at(line)])?;
-        Some((step.position.x * 1e3).round() / 1e3)
+    let waits = |here, [now, next]: [f64; 2], line: f64| {
+        drives::is_queued(at(here), [Some(at(now)), Some(at(next))], &[at(line)])
     };
-    assert_eq!(moves(30.0, [30.0, 30.0, 30.0], 35.0), Some(0.0));
-    // It starts with its log, from where it is; on its way, or when it comes, it moves by itself.
-    assert_eq!(moves(30.1, [30.0, 30.0, 31.0], 35.0), Some(0.9));
-    assert_eq!(moves(30.0, [29.0, 30.0, 31.0], 35.0), None);
-    assert_eq!(moves(30.0, [24.0, 27.0, 30.0], 35.0), None);
-    // It is not where its log is, the line is behind it, far away, or of another direction.
-    assert_eq!(moves(29.0, [30.0, 30.0, 30.0], 35.0), None);
-    assert_eq!(moves(30.0, [30.0, 30.0, 30.0], 25.0), None);
-    assert_eq!(moves(30.0, [30.0, 30.0, 30.0], 100.0), None);
+    assert!(waits(30.0, [30.0, 30.0], 35.0) && waits(30.1, [30.0, 30.0], 35.0));
+    // Its log starts, or it is not where its log is.
+    assert!(!waits(30.0, [30.0, 31.0], 35.0) && !waits(29.0, [30.0, 30.0], 35.0));
+    // The line is behind it, far away, or of another direction.
+    assert!(!waits(30.0, [30.0, 30.0], 25.0) && !waits(30.0, [30.0, 30.0], 100.0));
     let (here, aside) = (at(30.0), Pose::new(35.0, 0.0, 1.5));
-    assert!(drives::queued_move(here, [Some(here); 3], &[aside]).is_none());
-    assert!(drives::queued_move(here, [Some(here), Some(here), None], &[at(35.0)]).is_none());
+    assert!(!drives::is_queued(here, [Some(here); 2], &[aside]));
+    assert!(!drives::is_queued(here, [Some(here), None], &[at(35.0)]));
 }
 
 /// A crowd joins samples under the rules, in which nobody stands inside another at first.
