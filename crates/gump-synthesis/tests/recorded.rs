@@ -149,7 +149,7 @@ fn vehicles_pass_those_that_are_parked_partly_in_the_lane() {
         "{narrow} are partly in a lane"
     );
     let mean = clearance / f64::from(passes);
-    assert!(passes >= 50, "{passes} passes, {mean} m");
+    assert!(passes >= 35, "{passes} passes, {mean} m");
     assert!((0.6..1.6).contains(&mean), "{mean} m between the sides");
 }
 
@@ -380,4 +380,36 @@ fn half_of_the_drivers_roll_over_stop_lines() {
         passes > 15 && (0.2..0.8).contains(&share),
         "{stops} of {passes}"
     );
+}
+
+#[test]
+fn curbs_of_car_parks_stay_beside_the_lanes_of_wide_roads() {
+    let config = SynthesisConfig {
+        family: Some(RoadFamily::Arterial),
+        ..PROFILE.config()
+    };
+    let scenes = (0..12).into_par_iter();
+    scenes.for_each(|k| {
+        let scene = PROFILE.synthesize_clean(&config, Seed(78).fork(k));
+        for lane in scene.map.lanes() {
+            let way = &lane.centerline;
+            let turn =
+                angle_difference(way.pose_at(way.length()).heading, way.pose_at(0.0).heading);
+            // Those that turn may lead across a closed mouth.
+            let is_fast = lane.speed_limit.is_some_and(|limit| limit > 10.0);
+            if turn.abs() > 0.5 || !is_fast || lane.kind != LaneKind::SurfaceStreet {
+                continue;
+            }
+            for point in way.points() {
+                let edge = scene.map.nearest_road_edges(*point).next();
+                let distance = edge.map_or(10.0, |edge| edge.2);
+                assert!(
+                    distance > 0.5,
+                    "{}: {:?} at {point}: {distance}",
+                    scene.id,
+                    lane.id
+                );
+            }
+        }
+    });
 }

@@ -12,6 +12,9 @@ pub(crate) const CROSSWALK_DEPTH: f64 = 3.2;
 pub(crate) const STOP_GAP: f64 = 1.3;
 /// From the crosswalk to the rounding of the curb, metres. Chosen by eye.
 const CURB_GAP: f64 = 0.5;
+/// Least length of the driveway of a car park between its junctions, and of the far one, metres. Chosen
+/// by hand.
+const DRIVEWAY_M: f64 = 4.5;
 
 /// One road end at a junction, seen looking away from the junction.
 #[derive(Clone, Debug)]
@@ -139,7 +142,11 @@ fn setbacks(plan: &Plan, node: &NodePlan, ends: &[(usize, bool)]) -> Vec<f64> {
         let (left, right) = (a.half_width(!ends[i].1), b.half_width(ends[j].1));
         let (sin, cos) = angle.sin_cos();
         let tangent = node.corner_radius / (angle / 2.0).tan();
-        let limit = |road: &RoadPlan| 0.4 * road.reference.length();
+        // A driveway begins at the curb of its road, which may be wide, and leads to a small junction.
+        let limit = |road: &RoadPlan| match road.is_inner() {
+            true => road.reference.length() - DRIVEWAY_M,
+            false => 0.4 * road.reference.length(),
+        };
         let along = |mine: f64, other: f64| (other + mine * cos) / sin + tangent.min(12.0);
         setbacks[i] = f64::max(setbacks[i], along(left, right).min(limit(a)));
         setbacks[j] = f64::max(setbacks[j], along(right, left).min(limit(b)));
