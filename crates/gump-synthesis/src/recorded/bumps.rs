@@ -13,9 +13,9 @@ use crate::plan::Plan;
 /// Share of scenes that may have bumps.
 const SCENES: f64 = 0.9;
 /// Share of the roads of such a scene that have them.
-const ROADS: f64 = 0.5;
-/// Roads with a higher limit have none, m/s: a quarter of the recorded vehicles pass at over 17 m/s.
-const FASTEST: f64 = 24.0;
+const ROADS: f64 = 0.7;
+/// Roads with a higher limit have none, m/s.
+const FASTEST: f64 = 30.0;
 /// Metres of road without bumps at its ends.
 const ENDS: f64 = 14.0;
 /// Distance between two bumps of a road, metres.

@@ -25,6 +25,10 @@ const OWN_JUNCTION: f64 = 26.0;
 /// Length of a driveway between the road and the first bay, metres: of one aisle alone, and of
 /// several side by side.
 const DRIVEWAY: [f64; 2] = [16.0, 11.0];
+/// Share of car parks and yards with a stop sign at the exit, and of junctions of side roads with
+/// crosswalks.
+const SIGNED_EXITS: f64 = 0.5;
+const WALKED: f64 = 0.4;
 /// Metres that are seen of a yard, from the curb.
 const YARD: std::ops::Range<f64> = 11.0..24.0;
 /// Share of scenes with a car park of several aisles, as in front of shops.
@@ -106,7 +110,7 @@ fn add_side_road(plan: &mut Plan, at: (usize, f64, bool), extent: f64, rng: &mut
         0.0..0.9 => Control::MinorStop,
         _ => Control::MinorYield,
     };
-    let corners = (rng.random_bool(0.15), rng.random_range(3.5..7.0));
+    let corners = (rng.random_bool(WALKED), rng.random_range(3.5..7.0));
     let node = split(plan, at, control, corners);
     plan.roads.push(RoadPlan {
         reference,
@@ -132,9 +136,17 @@ fn add_car_park(plan: &mut Plan, at: (usize, f64, bool), extent: f64, rng: &mut 
         return false;
     }
     let radius = rng.random_range(3.5..7.0);
-    let node = split(plan, at, Control::MinorYield, (false, radius));
+    let node = split(plan, at, exit(rng), (false, radius));
     add_aisle(plan, node, &whole, driveway, &style);
     true
+}
+
+/// What holds vehicles that leave a car park or yard.
+fn exit(rng: &mut Rng) -> Control {
+    match rng.random_bool(SIGNED_EXITS) {
+        true => Control::MinorStop,
+        false => Control::MinorYield,
+    }
 }
 
 /// Adds a short way into a yard, in which vehicles disappear out of sight.
@@ -152,7 +164,7 @@ fn add_yard(plan: &mut Plan, at: (usize, f64, bool), extent: f64, rng: &mut Rng)
         return false;
     }
     let radius = rng.random_range(1.5..4.0);
-    let node = split(plan, at, Control::MinorYield, (false, radius));
+    let node = split(plan, at, exit(rng), (false, radius));
     plan.roads.push(RoadPlan {
         reference: whole,
         ends: [Some(node), None],
@@ -196,7 +208,7 @@ fn add_wide_car_park(plan: &mut Plan, at: (usize, f64, bool), extent: f64, rng: 
     // The farthest first: what is left of the road keeps its place in the plan.
     for (s, pose) in starts.into_iter().rev() {
         let radius = rng.random_range(1.5..3.0);
-        let node = split(plan, (road, s, left), Control::MinorYield, (false, radius));
+        let node = split(plan, (road, s, left), exit(rng), (false, radius));
         let length = length * rng.random_range(0.85..1.0);
         let whole = Track::through(&bend(pose, driveway + length, &[]));
         add_aisle(plan, node, &whole, driveway, &style);
