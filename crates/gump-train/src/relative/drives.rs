@@ -282,8 +282,9 @@ impl TrackDriver for NetworkDriver {
                             others.map(|(_, other)| other)
                         });
                         let pace = paces[i].as_ref();
+                        let as_logged = pace.is_some_and(|pace| pace.is_as_logged(step));
                         let pace = pace.map_or(0.0, |pace| pace.fault(own, step, others()));
-                        roads[i].fault(own, step, || has_room(i)) + pace
+                        roads[i].fault(own, step, as_logged, || has_room(i)) + pace
                     }
                 };
                 let ground = (lane_map, &fault as &Fault<'_>);

@@ -39,7 +39,7 @@ const EASY: BendLimits = BendLimits {
 };
 /// What hardly a driver exceeds. A vehicle that is faster than this allows loses ...
 const HARD: BendLimits = BendLimits {
-    lateral_mps2: 4.0,
+    lateral_mps2: 5.0,
     braking_mps2: 3.0,
     ahead_m: 60.0,
 };
@@ -115,9 +115,14 @@ impl<'a> Road<'a> {
             streets,
             lights,
             on,
-            most: on.map_or(f64::INFINITY, |(lane, at)| {
-                approach_speed(streets, lane, at, HARD, &entering)
-            }),
+            // In a junction lanes lie upon each other: it may be on any of them.
+            most: match drives {
+                true => lanes_under(streets, now.pose)
+                    .map(|(lane, at, _)| approach_speed(streets, lane, at, HARD, &entering))
+                    .reduce(f64::max)
+                    .unwrap_or(f64::INFINITY),
+                false => f64::INFINITY,
+            },
             yields: false,
             turns: on.is_some_and(|on| is_at_junction(streets, on)),
             is_free: OnceCell::new(),
@@ -153,8 +158,15 @@ impl<'a> Road<'a> {
 
     /// By how much a move is beyond what drivers do, metres per second; 0 for one that they make.
     ///
-    /// `has_room` says whether the vehicle sees nothing to slow down for, or to stand for.
-    pub(super) fn fault(&self, now: &Shown, step: &Pose, has_room: impl Fn() -> bool) -> f64 {
+    /// `has_room` says whether the vehicle sees nothing to slow down for, or to stand for; its log may
+    /// have been as slow here for a reason that nobody sees (`as_logged`).
+    pub(super) fn fault(
+        &self,
+        now: &Shown,
+        step: &Pose,
+        as_logged: bool,
+        has_room: impl Fn() -> bool,
+    ) -> f64 {
         if !self.drives {
             return 0.0;
         }
@@ -177,6 +189,7 @@ impl<'a> Road<'a> {
                 .is_free
                 .get_or_init(|| !self.yields && of_road() && has_room())
         };
+        let is_free = || !as_logged && is_free();
         let slow = match lost > SLOWS_MPS && turn <= STRAIGHT && is_free() {
             true => lost - SLOWS_MPS,
             false => 0.0,
@@ -269,14 +282,19 @@ pub(super) fn sign_lines(streets: &MapGraph) -> impl Iterator<Item = Pose> + '_ 
 
 /// The lane that a vehicle is on, and its distance from the start, metres.
 pub(super) fn lane_under(streets: &MapGraph, pose: Pose) -> Option<(&Lane, f64)> {
+    let on = lanes_under(streets, pose);
+    let (lane, at, _) = on.min_by(|a, b| a.2.total_cmp(&b.2))?;
+    Some((lane, at))
+}
+
+/// All lanes that it may be on, its distance from the start, and from the centre, metres.
+fn lanes_under(streets: &MapGraph, pose: Pose) -> impl Iterator<Item = (&Lane, f64, f64)> {
     let lanes = streets.lanes_near(pose.position, IN_LANE_M);
-    let on = lanes.filter_map(|(lane, distance)| {
+    lanes.filter_map(move |(lane, distance)| {
         let at = lane.centerline.project(pose.position).arc_length;
         let way = lane.centerline.pose_at(at).heading;
         (angle_difference(way, pose.heading).abs() <= IN_LANE).then_some((lane, at, distance))
-    });
-    let (lane, at, _) = on.min_by(|a, b| a.2.total_cmp(&b.2))?;
-    Some((lane, at))
+    })
 }
 
 /// Whether a lane goes on from here without a junction, a stop sign or a bend that drivers at this
@@ -343,7 +361,7 @@ mod tests {
         let now = Shown::first(BODY, Pose::new(x, 0.0, 0.0), dvec2(speed, 0.0));
         let step = Pose::new(next * TOKEN_DT, 0.0, turn);
         let lights = Lights::default();
-        Road::ahead_of(&now, false, streets, &lights).fault(&now, &step, || true)
+        Road::ahead_of(&now, false, streets, &lights).fault(&now, &step, false, || true)
     }
 
     #[test]
@@ -357,7 +375,7 @@ mod tests {
             let by_lane = [2, 4].map(|lane| (LaneId(lane), colour, None)).to_vec();
             let lights = Lights { by_lane };
             let road = Road::ahead_of(&now, false, &map, &lights);
-            road.fault(&now, &Pose::new(next * TOKEN_DT, 0.0, 0.0), || false)
+            road.fault(&now, &Pose::new(next * TOKEN_DT, 0.0, 0.0), false, || false)
         };
         let red = |x: f64, speeds| at((x, 0.0), speeds, LightState::Red);
         // The front is 18 m from the line: 10.4 m/s are the most.
@@ -406,7 +424,7 @@ mod tests {
         let at = |x: f64, (speed, next): (f64, f64), most: f64| {
             let now = Shown::first(BODY, Pose::new(x, 0.0, 0.0), dvec2(speed, 0.0));
             let road = Road::ahead_of(&now, false, &map, &lights).yielding(most);
-            road.fault(&now, &Pose::new(next * TOKEN_DT, 0.0, 0.0), || true)
+            road.fault(&now, &Pose::new(next * TOKEN_DT, 0.0, 0.0), false, || true)
         };
         assert!(at(40.0, (8.0, 8.0), 6.0) > 1.0 && at(40.0, (8.0, 6.0), 6.0) == 0.0);
         // In a junction it may stand for others.
@@ -453,10 +471,10 @@ mod tests {
             };
             let road = Road::ahead_of(&now, false, &map, &lights);
             assert_eq!(
-                road.fault(&now, &Pose::new(0.5, 0.0, 0.0), || has_room),
+                road.fault(&now, &Pose::new(0.5, 0.0, 0.0), false, || has_room),
                 0.0
             );
-            road.fault(&now, &Pose::IDENTITY, || has_room) > 0.0
+            road.fault(&now, &Pose::IDENTITY, false, || has_room) > 0.0
         };
         use LightState::{Green, Red};
         // In the lane, with and without room; at the line, by its light; in the junction.

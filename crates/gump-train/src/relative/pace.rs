@@ -27,6 +27,8 @@ const SAME_M: f64 = 0.1;
 /// metres.
 const HERE_M: f64 = 0.3;
 const STANDS_M: f64 = 0.1;
+/// A move is as slow as the log up to this, metres per second.
+const AS_SLOW_MPS: f64 = 0.2;
 /// An agent is slow if it falls below this share of its log's speed and this, metres per second, ...
 const SHARE: f64 = 0.8;
 const SLOWER_MPS: f64 = 0.5;
@@ -48,6 +50,8 @@ const LOSES_MPS: f64 = 0.5;
 
 /// How fast an agent is expected to go on.
 pub(super) struct Pace {
+    /// Speed of its log, metres per second.
+    speed: f64,
     /// Least speed if nothing is in the way, and greatest speed, metres per second.
     least: f64,
     most: f64,
@@ -70,6 +74,7 @@ impl Pace {
             && place.is_known(CRUISE_STEPS)
             && (1..=CRUISE_STEPS).all(keeps);
         Some(Self {
+            speed,
             least: least.min(most),
             most: match cruises {
                 true => (FASTER * speed + FASTER_MPS).max(own - LOSES_MPS),
@@ -78,6 +83,11 @@ impl Pace {
             way: place.way(now.pose),
             is_clear: OnceCell::new(),
         })
+    }
+
+    /// Whether a move is no slower than its log is here.
+    pub(super) fn is_as_logged(&self, step: &Pose) -> bool {
+        step.position.length() / TOKEN_DT > self.speed - AS_SLOW_MPS
     }
 
     /// By how much a move is slower or faster than that, metres per second; `others` are all agents.
@@ -275,6 +285,17 @@ mod tests {
         // Later, also a little behind.
         assert!(stays(7, 10.1) > 0.2 && stays(7, 9.0) > 0.7);
         assert_eq!(fault(&log, 7, car((9.0, 0.0), 0.0), 0.8), 0.0);
+    }
+
+    #[test]
+    fn who_is_as_slow_as_its_log_has_a_reason() {
+        let log = log(&QUEUED);
+        let is_as_logged = |t: usize, next: f64| {
+            let pace = Pace::of_log(&log, t, &car((10.0, 0.0), 0.0), f64::INFINITY);
+            pace.unwrap()
+                .is_as_logged(&Pose::new(next * TOKEN_DT, 0.0, 0.0))
+        };
+        assert!(is_as_logged(2, 0.0) && !is_as_logged(4, 0.0) && is_as_logged(4, 0.9));
     }
 
     #[test]
