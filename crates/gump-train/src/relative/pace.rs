@@ -38,13 +38,15 @@ const GAINS_MPS: f64 = 0.75;
 /// ahead, metres, while others go on as they do.
 const STEPS: usize = 4;
 const SPACE_M: f64 = 1.0;
-/// Its log cruises if it is faster than this, metres per second, and keeps this share of its speed for so
-/// many steps. There an agent is fast above that share and this, metres per second.
-const CRUISES_MPS: f64 = 3.0;
-const KEEPS: f64 = 0.9;
-const CRUISE_STEPS: usize = 6;
+/// An agent is fast if it exceeds this share of its log's greatest speed within so many steps before and
+/// after the place, and this, metres per second: who waited for others may find the road free.
 const FASTER: f64 = 1.2;
-const FASTER_MPS: f64 = 0.7;
+const FASTER_MPS: f64 = 0.5;
+const AROUND: usize = 3;
+/// Beyond that speed and this, metres per second, what drives gains no more than this in a step, metres
+/// per second, as much as `faults` allows it to lose on a free road.
+const AS_FAST_MPS: f64 = 0.2;
+const HASTY_MPS: f64 = 0.4;
 /// One that is too fast loses at least this in a step, metres per second.
 const LOSES_MPS: f64 = 0.5;
 
@@ -55,6 +57,8 @@ pub(super) struct Pace {
     /// Least speed if nothing is in the way, and greatest speed, metres per second.
     least: f64,
     most: f64,
+    /// Greatest speed of its log around here, metres per second; infinite if it stands.
+    fastest: f64,
     /// The way ahead, from the agent on, and whether nothing is in it.
     way: Vec<Pose>,
     is_clear: OnceCell<bool>,
@@ -65,21 +69,19 @@ impl Pace {
     /// greatest speed for anything else, metres per second.
     pub(super) fn of_log(log: &[Option<Pose>], t: usize, now: &Shown, most: f64) -> Option<Self> {
         let place = Place::of(log, t, now)?;
-        let speed = place.metres_of(0) / TOKEN_DT;
+        let speed = place.metres() / TOKEN_DT;
         let own = now.velocity().length();
         let least = (SHARE * speed - SLOWER_MPS).min(own + GAINS_MPS);
-        let keeps = |step: usize| place.metres_of(step) / TOKEN_DT > KEEPS * speed;
-        let cruises = speed > CRUISES_MPS
-            && now.body.kind != AgentKind::Pedestrian
-            && place.is_known(CRUISE_STEPS)
-            && (1..=CRUISE_STEPS).all(keeps);
+        // Who stands may start before its log does.
+        let fastest = match place.fastest() {
+            metres if metres < STANDS_M => f64::INFINITY,
+            metres => metres / TOKEN_DT,
+        };
         Some(Self {
             speed,
             least: least.min(most),
-            most: match cruises {
-                true => (FASTER * speed + FASTER_MPS).max(own - LOSES_MPS),
-                false => f64::INFINITY,
-            },
+            most: (FASTER * fastest + FASTER_MPS).max(own - LOSES_MPS),
+            fastest,
             way: place.way(now.pose),
             is_clear: OnceCell::new(),
         })
@@ -98,8 +100,10 @@ impl Pace {
         others: impl Iterator<Item = &'a Shown>,
     ) -> f64 {
         let next = step.position.length() / TOKEN_DT;
-        if next > self.most {
-            return next - self.most;
+        let gained = next - now.velocity().length();
+        let is_hasty = next > self.fastest + AS_FAST_MPS && gained > HASTY_MPS;
+        if next > self.most || is_hasty && now.body.kind != AgentKind::Pedestrian {
+            return (next - self.most).max(gained - HASTY_MPS);
         }
         let slow = (self.least - next).max(0.0);
         let is_clear = || *self.is_clear.get_or_init(|| self.is_clear(now, others));
@@ -188,22 +192,23 @@ impl<'a> Place<'a> {
         Some(Self { log, at, part })
     }
 
-    /// Whether the log goes on for so many steps.
-    fn is_known(&self, steps: usize) -> bool {
-        let ahead = self.log.get(self.at..=self.at + steps + 1);
-        ahead.is_some_and(|ahead| ahead.iter().all(Option::is_some))
+    /// Metres that the log covers from a frame to the next, if it is known.
+    fn step(&self, at: usize) -> Option<f64> {
+        let (from, to) = ((*self.log.get(at)?)?, (*self.log.get(at + 1)?)?);
+        Some(from.position.distance(to.position))
     }
 
-    /// Metres that the log covers within half a second, so many steps after it was here; the last known
-    /// if it ends before.
-    fn metres_of(&self, step: usize) -> f64 {
-        let of = |at: usize| {
-            let (from, to) = ((*self.log.get(at)?)?, (*self.log.get(at + 1)?)?);
-            Some(from.position.distance(to.position))
-        };
-        let first = of(self.at + step).unwrap_or(0.0);
-        let second = of(self.at + step + 1).unwrap_or(first);
+    /// The same in the half second from here on; the last known if it ends before.
+    fn metres(&self) -> f64 {
+        let first = self.step(self.at).unwrap_or(0.0);
+        let second = self.step(self.at + 1).unwrap_or(first);
         (1.0 - self.part) * first + self.part * second
+    }
+
+    /// The most that it covers in half a second around here.
+    fn fastest(&self) -> f64 {
+        let around = self.at.saturating_sub(AROUND)..=self.at + AROUND;
+        around.filter_map(|at| self.step(at)).fold(0.0, f64::max)
     }
 
     /// The poses from the agent's on.
@@ -326,15 +331,18 @@ mod tests {
     }
 
     #[test]
-    fn where_its_log_cruises_nobody_is_much_faster() {
-        let log = log(&[0.0, 4.0, 8.0, 12.0, 16.0, 20.0, 24.0, 28.0, 32.0, 36.0]);
-        // 10.3 m/s are the most; one that is faster loses 0.5.
-        assert!(fault(&log, 1, car((5.0, 0.0), 10.0), 10.8) > 0.4);
-        assert_eq!(fault(&log, 1, car((5.0, 0.0), 10.0), 10.2), 0.0);
+    fn nobody_is_much_faster_than_its_log_around_there() {
+        let log = log(&[0.0, 4.0, 8.0, 12.0, 16.0, 20.0, 23.0, 25.0, 26.0, 26.5]);
+        // 10.1 m/s are the most; one that is faster loses 0.5.
+        assert!(fault(&log, 1, car((5.0, 0.0), 10.0), 10.6) > 0.4);
+        // Nobody gains much beyond 8.
+        assert!((fault(&log, 1, car((5.0, 0.0), 8.0), 8.7) - 0.3).abs() < 1e-9);
+        assert_eq!(fault(&log, 1, car((5.0, 0.0), 6.0), 7.0), 0.0);
+        assert_eq!(fault(&log, 1, car((5.0, 0.0), 10.0), 10.0), 0.0);
         assert!(fault(&log, 1, car((5.0, 0.0), 14.0), 14.0) > 0.4);
         assert_eq!(fault(&log, 1, car((5.0, 0.0), 14.0), 13.4), 0.0);
-        // Where it slows down within three seconds, nobody knows.
-        assert_eq!(fault(&log, 5, car((21.0, 0.0), 10.0), 10.8), 0.0);
+        // Where it slows down nobody has to.
+        assert_eq!(fault(&log, 6, car((23.5, 0.0), 8.0), 8.0), 0.0);
     }
 
     #[test]
