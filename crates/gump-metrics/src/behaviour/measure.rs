@@ -33,6 +33,8 @@ pub enum Measure {
     Standing,
     /// A vehicle that moves slowly in the present stands at a given time.
     ComeToRest,
+    /// Speed, at a given time, of an agent that moves in the present, metres per second.
+    Speed,
     /// Lights of crossing approaches are green at the same time.
     ConflictingGreen,
     /// A light changes its colour.
@@ -47,7 +49,7 @@ pub enum Measure {
 
 impl Measure {
     /// All, in the order of tables.
-    pub const ALL: [Self; 17] = [
+    pub const ALL: [Self; 18] = [
         Self::ParkedMove,
         Self::FreeRoadStop,
         Self::FreeRoadStanding,
@@ -60,6 +62,7 @@ impl Measure {
         Self::SetOff,
         Self::Standing,
         Self::ComeToRest,
+        Self::Speed,
         Self::ConflictingGreen,
         Self::LightChange,
         Self::LightRed,
@@ -82,6 +85,7 @@ impl Measure {
             Self::SetOff => "set_off",
             Self::Standing => "standing",
             Self::ComeToRest => "come_to_rest",
+            Self::Speed => "speed_mps",
             Self::ConflictingGreen => "conflicting_green",
             Self::LightChange => "light_change",
             Self::LightRed => "light_red",
@@ -103,6 +107,7 @@ impl Measure {
             Self::FreeRoadStanding => "vehicle that moves",
             Self::NewOverlap | Self::Standing => "agent",
             Self::ComeToRest => "vehicle that moves slowly",
+            Self::Speed => "agent that moves",
             Self::HardAcceleration | Self::SetOff => "minute",
             Self::LightChange => "minute of a light",
             Self::LightRed => "time of a light",
@@ -119,15 +124,15 @@ impl Measure {
         self.per().starts_with("minute")
     }
 
-    /// True if the value is a mean duration in seconds. What is neither a rate nor a duration is a
-    /// share or a number per agent.
+    /// True if the value is a mean duration in seconds. What is neither a rate nor a duration nor
+    /// [`Measure::Speed`] is a share or a number per agent.
     pub fn is_duration(self) -> bool {
         matches!(self, Self::RedPhase | Self::GreenPhase)
     }
 
     /// True if the value is of moments instead of the whole horizon.
     pub fn is_of_moments(self) -> bool {
-        matches!(self, Self::Standing | Self::ComeToRest)
+        matches!(self, Self::Standing | Self::ComeToRest | Self::Speed)
     }
 
     /// True if the value depends on the horizon, so that a shorter log has none.
@@ -229,7 +234,8 @@ pub struct Key {
 /// Events and their denominator.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Count {
-    /// Events; of a measure that [is a duration](Measure::is_duration) seconds.
+    /// Events; of a measure that [is a duration](Measure::is_duration) seconds, of speeds their sum,
+    /// metres per second.
     pub events: f64,
     /// The denominator, in the unit of [`Measure::per`].
     pub of: f64,

@@ -18,6 +18,7 @@
 //! | `set_off` | who stood for a second goes faster than 1 m/s | minute that agents are there |
 //! | `standing` | over the last second the agent got less than 0.3 m away; at some moments | agent that is there and that the log also sees then |
 //! | `come_to_rest` | a vehicle that drove at 1 to 12 m/s over the last second before the present stands, at the same moments | vehicle that drove so and that the log also sees then |
+//! | `speed_mps` | speed over the last second, m/s, of an agent that did not stand in the present, at the same moments | agent that did not stand and that the log also sees then |
 //! | `conflicting_green` | two lights are green at once whose lanes cross, coming from roads at 45 to 135 degrees | time that the colours of such pairs are known |
 //! | `light_change` | a light that controls a lane of the map, and whose colour is known in the present, changes it | minute that its colour is known |
 //! | `light_red` | such a light is red | time that its colour is known |

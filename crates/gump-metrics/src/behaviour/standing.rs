@@ -97,6 +97,11 @@ impl Counter<'_> {
                 if class == Class::Vehicle && before.is_some_and(|pace| SLOW.contains(&pace)) {
                     self.seen.tally.add(key(Measure::ComeToRest), count);
                 }
+                if before.is_some_and(|pace| pace >= STANDS) {
+                    let events = pace;
+                    let count = Count { events, of: 1.0 };
+                    self.seen.tally.add(key(Measure::Speed), count);
+                }
             }
         }
     }

@@ -553,6 +553,13 @@ fn who_drives_slowly_and_comes_to_rest() {
     assert_eq!([2, 8].map(|s| at_rest(&log, s)), [(0.0, 1.0), (0.0, 1.0)]);
     let cyclist = future.count(Measure::ComeToRest, Class::Bicycle, 8);
     assert_eq!(cyclist.rate(), None);
+    // Mean speeds of those that move: the ego and the fast one, and the cyclist.
+    let speed = |tally: &Tally, class| tally.count(Measure::Speed, class, 8);
+    let (slowed, logged) = (speed(&future, Class::Vehicle), speed(&log, Class::Vehicle));
+    assert_eq!((slowed.of, logged.of), (2.0, 2.0));
+    assert!((logged.events - 30.0).abs() < 0.1 && (slowed.events - 20.0).abs() < 0.1);
+    let ridden = speed(&future, Class::Bicycle).rate().unwrap();
+    assert!((ridden - 5.0).abs() < 0.1, "{ridden}");
 }
 
 #[test]

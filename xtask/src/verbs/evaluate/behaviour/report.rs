@@ -23,7 +23,7 @@ const DRAWS: usize = 1000;
 /// A chart: its name, what its axis says, and which measures are on it.
 type Chart = (&'static str, &'static str, fn(Measure) -> bool);
 
-const CHARTS: [Chart; 4] = [
+const CHARTS: [Chart; 5] = [
     (
         "shares",
         "share, or number per agent, with 95 % intervals over scenarios",
@@ -37,7 +37,12 @@ const CHARTS: [Chart; 4] = [
     (
         "standing",
         "share that stands, with 95 % intervals over scenarios",
-        Measure::is_of_moments,
+        |measure| measure.is_of_moments() && measure != Measure::Speed,
+    ),
+    (
+        "speeds",
+        "mean speed of agents that move in the present, m/s, with 95 % intervals over scenarios",
+        |measure| measure == Measure::Speed,
     ),
     (
         "phases",
@@ -237,7 +242,7 @@ fn chart(label: &str, columns: &[&Column], keys: &[Key], shows: impl Fn(Measure)
             seconds,
         } = keys[i];
         match measure {
-            Measure::Standing => format!("{class}, {seconds} s"),
+            Measure::Standing | Measure::Speed => format!("{class}, {seconds} s"),
             Measure::ComeToRest => format!("{class}, slow, {seconds} s"),
             _ => format!("{}, {class}", measure.name().replace('_', " ")),
         }
