@@ -68,10 +68,7 @@ pub(crate) fn stands_without(
             };
             let binds = |light: &&Light| light.lane == lane.id && light.state != LightState::Green;
             let mut lines = lights.iter().filter(binds);
-            let mut signs = map
-                .stop_signs()
-                .iter()
-                .filter(|s| s.lanes.contains(&lane.id));
+            let mut signs = map.stop_signs_of(lane.id);
             lines.any(|light| ahead(stop_line(lane, light).position))
                 || signs.any(|sign| ahead(DVec2::new(sign.position.x, sign.position.y)))
         });

@@ -249,6 +249,12 @@ impl MapGraph {
         &self.parts.stop_signs
     }
 
+    /// Stop signs that apply to a lane.
+    pub fn stop_signs_of(&self, lane: LaneId) -> impl Iterator<Item = &StopSign> {
+        let signs = self.stop_signs().iter();
+        signs.filter(move |sign| sign.lanes.contains(&lane))
+    }
+
     /// Surfaces a vehicle may be on.
     pub fn drivable(&self) -> &[Polygon] {
         &self.parts.drivable

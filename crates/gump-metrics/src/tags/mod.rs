@@ -572,7 +572,7 @@ fn is_all_way_stop(s: &Situation<'_>) -> bool {
             points[points.len() - 1].distance(here) < 25.0
         })
         .collect();
-    let ruled = |id| map.stop_signs().iter().any(|sign| sign.lanes.contains(&id));
+    let ruled = |id| map.stop_signs_of(id).next().is_some();
     approaches.len() >= 3 && approaches.iter().all(|lane| ruled(lane.id))
 }
 

@@ -372,11 +372,7 @@ fn light_ahead(frame: &Frame, ego: &Agent, ways: &[(&Lane, f64)]) -> Option<Ahea
 }
 
 fn stop_sign_ahead(map: &MapGraph, ego: &Agent, ways: &[(&Lane, f64)]) -> Option<Ahead<()>> {
-    let ruled = |lane: &Lane| {
-        map.stop_signs()
-            .iter()
-            .any(|sign| sign.lanes.contains(&lane.id))
-    };
+    let ruled = |lane: &Lane| map.stop_signs_of(lane.id).next().is_some();
     let found = ways.iter().find(|(lane, _)| ruled(lane))?;
     // The sign of a lane through the intersection stands at its start, that of others at the end.
     let length = found.0.centerline.length();

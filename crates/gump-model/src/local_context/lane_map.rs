@@ -95,7 +95,7 @@ impl LaneMap {
                 lane: number,
             });
             lane_map.points.extend(poses);
-            let stands_at = map.stop_signs().iter().find(|s| s.lanes.contains(&lane.id));
+            let stands_at = map.stop_signs_of(lane.id).next();
             let stop = stands_at.map(|sign| {
                 let s = line.project(sign.position.truncate()).arc_length;
                 first + (s / LANE_STEP_M).round() as u32

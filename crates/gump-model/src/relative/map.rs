@@ -161,7 +161,7 @@ impl VectorMap {
         for lane in map.lanes() {
             let line = &lane.centerline;
             let n = (line.length() / LANE_PIECE_M).ceil().max(1.0) as usize;
-            let stops = tells_stops && map.stop_signs().iter().any(|s| s.lanes.contains(&lane.id));
+            let stops = tells_stops && map.stop_signs_of(lane.id).next().is_some();
             let mut before: Option<u32> = None;
             for i in 0..n {
                 let mut piece = piece(line, i, n, PieceKind::Lane, Some(lane.id));

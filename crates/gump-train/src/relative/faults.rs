@@ -262,8 +262,7 @@ pub(super) fn before_line(now: &Shown, metres: f64, least: f64) -> f64 {
 
 /// Whether a stop sign applies to a lane: at its start if it is in a junction, at its end otherwise.
 pub(super) fn has_sign(streets: &MapGraph, lane: &Lane) -> bool {
-    let signs = streets.stop_signs();
-    signs.iter().any(|sign| sign.lanes.contains(&lane.id))
+    streets.stop_signs_of(lane.id).next().is_some()
 }
 
 /// Where vehicles stop for signs.
