@@ -278,8 +278,9 @@ impl TrackDriver for NetworkDriver {
                     Some(_) => 0.0,
                     None => {
                         let (own, others) = (&agents[i], || {
-                            let others = agents.iter().enumerate().filter(|(j, _)| *j != i);
-                            others.map(|(_, other)| other)
+                            let others = agents.iter().zip(&paces).enumerate();
+                            let others = others.filter(|(j, _)| *j != i);
+                            others.map(|(_, (other, pace))| (other, pace.as_ref()))
                         });
                         let pace = paces[i].as_ref();
                         let as_logged = pace.is_some_and(|pace| pace.is_as_logged(step));

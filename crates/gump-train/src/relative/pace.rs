@@ -92,12 +92,13 @@ impl Pace {
         step.position.length() / TOKEN_DT > self.speed - AS_SLOW_MPS
     }
 
-    /// By how much a move is slower or faster than that, metres per second; `others` are all agents.
+    /// By how much a move is slower or faster than that, metres per second; `others` are all other agents
+    /// and their paces.
     pub(super) fn fault<'a>(
         &self,
         now: &Shown,
         step: &Pose,
-        others: impl Iterator<Item = &'a Shown>,
+        others: impl Iterator<Item = (&'a Shown, Option<&'a Self>)>,
     ) -> f64 {
         let next = step.position.length() / TOKEN_DT;
         let gained = next - now.velocity().length();
@@ -115,7 +116,11 @@ impl Pace {
 
     /// Whether an agent may go on with the least speed for a while, as far as others are concerned. Those
     /// that it touches already do not count, nor people for each other.
-    fn is_clear<'a>(&self, now: &Shown, mut others: impl Iterator<Item = &'a Shown>) -> bool {
+    fn is_clear<'a>(
+        &self,
+        now: &Shown,
+        mut others: impl Iterator<Item = (&'a Shown, Option<&'a Self>)>,
+    ) -> bool {
         let walks = now.body.kind == AgentKind::Pedestrian;
         let own: [Pose; STEPS + 1] =
             std::array::from_fn(|i| along(&self.way, self.least * TOKEN_DT * i as f64));
@@ -125,16 +130,12 @@ impl Pace {
             width: of.body.width,
         };
         let reach = (now.body.length + now.body.width) / 2.0 + SPACE_M;
-        others.all(|other| {
+        others.all(|(other, pace)| {
             let reach = reach + (other.body.length + other.body.width) / 2.0;
             let touches = || shape(now.pose, now, 0.0).overlaps(&shape(other.pose, other, 0.0));
             let meets = |(i, own): (usize, &Pose)| {
-                let position = other.pose.position + other.velocity() * (TOKEN_DT * i as f64);
-                let its = Pose {
-                    position,
-                    ..other.pose
-                };
-                own.position.distance_squared(position) < reach * reach
+                let its = ahead(other, pace, i);
+                own.position.distance_squared(its.position) < reach * reach
                     && shape(*own, now, SPACE_M).overlaps(&shape(its, other, 0.0))
             };
             let is_person = other.body.kind == AgentKind::Pedestrian;
@@ -219,6 +220,18 @@ impl<'a> Place<'a> {
     }
 }
 
+/// Where an agent is after so many steps if it goes on as fast as now: on its log's way, or straight on.
+fn ahead(of: &Shown, pace: Option<&Pace>, steps: usize) -> Pose {
+    let moved = of.velocity() * (TOKEN_DT * steps as f64);
+    match pace {
+        Some(pace) => along(&pace.way, moved.length()),
+        None => Pose {
+            position: of.pose.position + moved,
+            ..of.pose
+        },
+    }
+}
+
 /// The pose so many metres along a way, which goes on straight.
 fn along(way: &[Pose], metres: f64) -> Pose {
     let mut left = metres;
@@ -273,7 +286,8 @@ mod tests {
     fn fault_among(log: &[Option<Pose>], t: usize, own: Shown, next: f64, others: &[Shown]) -> f64 {
         let pace = Pace::of_log(log, t, &own, f64::INFINITY);
         let step = Pose::new(next * TOKEN_DT, 0.0, 0.0);
-        pace.map_or(0.0, |pace| pace.fault(&own, &step, others.iter()))
+        let others = others.iter().map(|other| (other, None));
+        pace.map_or(0.0, |pace| pace.fault(&own, &step, others))
     }
 
     fn fault(log: &[Option<Pose>], t: usize, own: Shown, next: f64) -> f64 {
@@ -327,7 +341,10 @@ mod tests {
         // Something else demands less.
         let slow = Pace::of_log(&log, 3, &car((10.0, 0.0), 8.0), 2.0).unwrap();
         let step = Pose::new(1.0, 0.0, 0.0);
-        assert_eq!(slow.fault(&car((10.0, 0.0), 8.0), &step, [].iter()), 0.0);
+        assert_eq!(
+            slow.fault(&car((10.0, 0.0), 8.0), &step, std::iter::empty()),
+            0.0
+        );
     }
 
     #[test]
@@ -352,6 +369,25 @@ mod tests {
             |other: Shown| fault_among(&log, 3, car((10.0, 0.0), 3.0), 2.0, &[other]) == 0.0;
         assert!(waits(car((16.0, 0.0), 0.0)) && waits(car((16.0, 0.0), 2.0)));
         assert!(!waits(car((17.0, 0.0), 6.0)) && !waits(car((16.0, 3.0), 0.0)));
+        // One that comes the other way, and turns off before.
+        let mut oncoming = car((24.0, 0.0), 0.0);
+        oncoming = Shown::first(oncoming.body, Pose::new(24.0, 0.0, 3.1), dvec2(-6.0, 0.0));
+        let turns = [
+            (24.0, 0.0),
+            (21.0, -1.5),
+            (20.0, -4.0),
+            (20.0, -7.0),
+            (20.0, -10.0),
+        ];
+        let poses = turns.map(|(x, y)| Some(Pose::new(x, y, 3.1)));
+        let its = Pace::of_log(&poses, 0, &oncoming, f64::INFINITY);
+        let own = car((10.0, 0.0), 3.0);
+        let pace = || Pace::of_log(&log, 3, &own, f64::INFINITY).unwrap();
+        let with = |its: Option<&Pace>| {
+            let others = std::iter::once((&oncoming, its));
+            pace().fault(&own, &Pose::new(1.0, 0.0, 0.0), others)
+        };
+        assert!(with(None) == 0.0 && with(its.as_ref()) > 0.0);
         // People walk through each other.
         let own = agent(AgentKind::Pedestrian, (10.0, 0.5), 1.0);
         let among = |kind| fault_among(&log, 3, own, 0.2, &[agent(kind, (13.0, 0.0), 0.0)]);
