@@ -35,9 +35,10 @@ const SLOWER_MPS: f64 = 0.5;
 /// ... or gains less than this in a step, metres per second, while it is slower than that.
 const GAINS_MPS: f64 = 0.75;
 /// It has nothing in its way if it could go on at that speed for so many steps, with this much space
-/// ahead, metres, while others go on as they do.
-const STEPS: usize = 4;
-const SPACE_M: f64 = 1.0;
+/// ahead and at each side, metres, while others go on as they do.
+const STEPS: usize = 6;
+const SPACE_M: f64 = 2.0;
+const SIDE_M: f64 = 0.3;
 /// An agent is fast if it exceeds this share of its log's greatest speed within so many steps before and
 /// after the place, and this, metres per second: who waited for others may find the road free.
 const FASTER: f64 = 1.2;
@@ -124,19 +125,20 @@ impl Pace {
         let walks = now.body.kind == AgentKind::Pedestrian;
         let own: [Pose; STEPS + 1] =
             std::array::from_fn(|i| along(&self.way, self.least * TOKEN_DT * i as f64));
-        let shape = |pose: Pose, of: &Shown, space: f64| OrientedBox {
-            pose: pose * Pose::new(space / 2.0, 0.0, 0.0),
-            length: of.body.length + space,
-            width: of.body.width,
+        let shape = |pose: Pose, of: &Shown, (ahead, side): (f64, f64)| OrientedBox {
+            pose: pose * Pose::new(ahead / 2.0, 0.0, 0.0),
+            length: of.body.length + ahead,
+            width: of.body.width + 2.0 * side,
         };
-        let reach = (now.body.length + now.body.width) / 2.0 + SPACE_M;
+        let bare = |of: &Shown| shape(of.pose, of, (0.0, 0.0));
+        let reach = (now.body.length + now.body.width) / 2.0 + SPACE_M + SIDE_M;
         others.all(|(other, pace)| {
             let reach = reach + (other.body.length + other.body.width) / 2.0;
-            let touches = || shape(now.pose, now, 0.0).overlaps(&shape(other.pose, other, 0.0));
+            let touches = || bare(now).overlaps(&bare(other));
             let meets = |(i, own): (usize, &Pose)| {
                 let its = ahead(other, pace, i);
                 own.position.distance_squared(its.position) < reach * reach
-                    && shape(*own, now, SPACE_M).overlaps(&shape(its, other, 0.0))
+                    && shape(*own, now, (SPACE_M, SIDE_M)).overlaps(&shape(its, other, (0.0, 0.0)))
             };
             let is_person = other.body.kind == AgentKind::Pedestrian;
             walks && is_person || !own.iter().enumerate().any(meets) || touches()
