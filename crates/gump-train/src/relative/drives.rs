@@ -269,7 +269,7 @@ impl TrackDriver for NetworkDriver {
                     given.push(stays.then_some(Pose::IDENTITY));
                     paces.push(match stays {
                         true => None,
-                        false => Pace::of_log(&logs[a], t, now, road.most()),
+                        false => Pace::of_log(&logs[a], t, now, road.calm()),
                     });
                     roads.push(road);
                 }

@@ -87,6 +87,8 @@ pub(super) struct Road<'a> {
     /// Greatest speed for the bends, lights, signs and vehicles with right of way ahead, metres per
     /// second.
     most: f64,
+    /// The same of who does not start or hurry at yellow.
+    calm: f64,
     /// Whether it has to let others pass.
     yields: bool,
     /// Whether it is at a junction.
@@ -107,21 +109,29 @@ impl<'a> Road<'a> {
     ) -> Self {
         let drives = now.body.kind == AgentKind::Vehicle && !stays;
         let on = drives.then(|| lane_under(streets, now.pose)).flatten();
-        let entering = |lane: &Lane, metres: f64| {
-            let red = before_red(now, lane, metres, lights);
-            red.min(before_sign(streets, now, lane, metres))
+        let most = |closed: &[LightState]| {
+            let entering = |lane: &Lane, metres: f64| {
+                let light = before_light(now, lane, metres, lights, closed);
+                light.min(before_sign(streets, now, lane, metres))
+            };
+            // In a junction lanes lie upon each other: it may be on any of them.
+            let of = |(lane, at, _): (&'a Lane, f64, f64)| {
+                approach_speed(streets, lane, at, HARD, &entering)
+            };
+            let speeds = drives.then(|| lanes_under(streets, now.pose).map(of));
+            let speeds = speeds.into_iter().flatten();
+            speeds.reduce(f64::max).unwrap_or(f64::INFINITY)
         };
+        let is_yellow = |(_, colour, _): &(_, LightState, _)| *colour == LightState::Yellow;
+        let red = most(&[LightState::Red]);
         Self {
             streets,
             lights,
             on,
-            // In a junction lanes lie upon each other: it may be on any of them.
-            most: match drives {
-                true => lanes_under(streets, now.pose)
-                    .map(|(lane, at, _)| approach_speed(streets, lane, at, HARD, &entering))
-                    .reduce(f64::max)
-                    .unwrap_or(f64::INFINITY),
-                false => f64::INFINITY,
+            most: red,
+            calm: match lights.by_lane.iter().any(is_yellow) {
+                true => most(&[LightState::Red, LightState::Yellow]),
+                false => red,
             },
             yields: false,
             turns: on.is_some_and(|on| is_at_junction(streets, on)),
@@ -135,14 +145,16 @@ impl<'a> Road<'a> {
     pub(super) fn yielding(self, most: f64) -> Self {
         Self {
             most: self.most.min(most),
+            calm: self.calm.min(most),
             yields: most.is_finite(),
             ..self
         }
     }
 
-    /// The greatest speed for bends, lights, signs and vehicles with right of way, metres per second.
-    pub(super) fn most(&self) -> f64 {
-        self.most
+    /// The greatest speed for bends, lights, signs and vehicles with right of way of who need not hurry,
+    /// metres per second.
+    pub(super) fn calm(&self) -> f64 {
+        self.calm
     }
 
     /// Whether no junction, stop sign or light is near that could hold a vehicle here: one that stands
@@ -158,8 +170,9 @@ impl<'a> Road<'a> {
 
     /// By how much a move is beyond what drivers do, metres per second; 0 for one that they make.
     ///
-    /// `has_room` says whether the vehicle sees nothing to slow down for, or to stand for; its log may
-    /// have been as slow here for a reason that nobody sees (`as_logged`).
+    /// `has_room` says whether the vehicle sees nothing to slow down for, or to stand for. At a junction
+    /// its log may be as slow for a reason that it does not see (`as_logged`); elsewhere it would learn
+    /// to slow down for nothing.
     pub(super) fn fault(
         &self,
         now: &Shown,
@@ -189,7 +202,7 @@ impl<'a> Road<'a> {
                 .is_free
                 .get_or_init(|| !self.yields && of_road() && has_room())
         };
-        let is_free = || !as_logged && is_free();
+        let is_free = || !(as_logged && self.turns) && is_free();
         let slow = match lost > SLOWS_MPS && turn <= STRAIGHT && is_free() {
             true => lost - SLOWS_MPS,
             false => 0.0,
@@ -224,10 +237,19 @@ fn astray(streets: &MapGraph, pose: Pose) -> f64 {
     off.fold(LOOK_M - NEAR_LANE_M, f64::min)
 }
 
-/// The greatest speed of a vehicle before a lane that starts `metres` ahead, for its light, metres per
-/// second.
-fn before_red(now: &Shown, lane: &Lane, metres: f64, lights: &Lights) -> f64 {
-    if lights.colour(lane.id) != Some(LightState::Red) {
+/// The greatest speed of a vehicle before a lane that starts `metres` ahead, for its light, if that has
+/// one of these colours, metres per second.
+fn before_light(
+    now: &Shown,
+    lane: &Lane,
+    metres: f64,
+    lights: &Lights,
+    closed: &[LightState],
+) -> f64 {
+    if !lights
+        .colour(lane.id)
+        .is_some_and(|colour| closed.contains(&colour))
+    {
         return f64::INFINITY;
     }
     let way = &lane.centerline;
@@ -388,6 +410,33 @@ mod tests {
         // A right turn goes slowly.
         let right = |next: f64| at((57.5, 50.0), (1.5, next), LightState::Red);
         assert!(right(1.9) == 0.0 && right(3.4) > 0.0);
+    }
+
+    #[test]
+    fn at_yellow_nobody_has_to_hurry() {
+        let map = streets("lane 1: 0,0 60,0 next 2\nlane 2: 60,0 120,0");
+        let calm = |colour: LightState, speed: f64| {
+            let now = Shown::first(BODY, Pose::new(47.75, 0.0, 0.0), dvec2(speed, 0.0));
+            let by_lane = vec![(LaneId(2), colour, None)];
+            Road::ahead_of(&now, false, &map, &Lights { by_lane }).calm()
+        };
+        // 10 m before the line; at 12 m/s it is too late to stop.
+        assert!((calm(LightState::Yellow, 5.0) - 60.0_f64.sqrt()).abs() < 0.2);
+        assert!(calm(LightState::Green, 5.0).is_infinite());
+        assert!(calm(LightState::Yellow, 12.0).is_infinite());
+    }
+
+    #[test]
+    fn what_its_log_does_in_a_junction_has_a_reason() {
+        let map = junction();
+        let lights = Lights::default();
+        let stays = |x: f64, as_logged: bool| {
+            let now = Shown::first(BODY, Pose::new(x, 0.0, 0.0), dvec2(0.0, 0.0));
+            let road = Road::ahead_of(&now, false, &map, &lights);
+            road.fault(&now, &Pose::IDENTITY, as_logged, || true) > 0.0
+        };
+        assert!(stays(75.0, false) && !stays(75.0, true));
+        assert!(stays(30.0, false) && stays(30.0, true));
     }
 
     #[test]
