@@ -283,9 +283,9 @@ impl TrackDriver for NetworkDriver {
                             others.map(|(_, (other, pace))| (other, pace.as_ref()))
                         });
                         let pace = paces[i].as_ref();
-                        let as_logged = pace.is_some_and(|pace| pace.is_as_logged(step));
+                        let logged = pace.map(Pace::logged);
                         let pace = pace.map_or(0.0, |pace| pace.fault(own, step, others()));
-                        roads[i].fault(own, step, as_logged, || has_room(i)) + pace
+                        roads[i].fault(own, step, logged, || has_room(i)) + pace
                     }
                 };
                 let ground = (lane_map, &fault as &Fault<'_>);

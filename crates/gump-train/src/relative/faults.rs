@@ -39,12 +39,19 @@ const EASY: BendLimits = BendLimits {
 };
 /// What hardly a driver exceeds. A vehicle that is faster than this allows loses ...
 const HARD: BendLimits = BendLimits {
-    lateral_mps2: 5.0,
+    lateral_mps2: 4.0,
     braking_mps2: 3.0,
     ahead_m: 60.0,
 };
+/// The same where bends do not count.
+const STRAIGHT_ON: BendLimits = BendLimits {
+    lateral_mps2: f64::INFINITY,
+    ..HARD
+};
 /// ... at least this in a step, metres per second.
 const BRAKES_MPS: f64 = 2.0;
+/// A move is as fast as the log, or as slow, up to this, metres per second.
+const AS_LOGGED_MPS: f64 = 0.2;
 /// A vehicle that would have to brake harder than this for a red light drives on, m/s². The distance
 /// that its front may be over the line and it still waits, metres.
 const HARDEST_MPS2: f64 = 6.0;
@@ -89,8 +96,8 @@ pub(super) struct Road<'a> {
     most: f64,
     /// The same of who does not start or hurry at yellow.
     calm: f64,
-    /// Whether it has to let others pass.
-    yields: bool,
+    /// The same for vehicles with right of way alone.
+    gives_way: f64,
     /// Whether it is at a junction.
     turns: bool,
     /// Whether it has nothing to slow down for, or to stand for; determined when it is asked for.
@@ -109,18 +116,9 @@ impl<'a> Road<'a> {
     ) -> Self {
         let drives = now.body.kind == AgentKind::Vehicle && !stays;
         let on = drives.then(|| lane_under(streets, now.pose)).flatten();
-        let most = |closed: &[LightState]| {
-            let entering = |lane: &Lane, metres: f64| {
-                let light = before_light(now, lane, metres, lights, closed);
-                light.min(before_sign(streets, now, lane, metres))
-            };
-            // In a junction lanes lie upon each other: it may be on any of them.
-            let of = |(lane, at, _): (&'a Lane, f64, f64)| {
-                approach_speed(streets, lane, at, HARD, &entering)
-            };
-            let speeds = drives.then(|| lanes_under(streets, now.pose).map(of));
-            let speeds = speeds.into_iter().flatten();
-            speeds.reduce(f64::max).unwrap_or(f64::INFINITY)
+        let most = |closed: &[LightState]| match drives {
+            true => most_speed(streets, lights, now, HARD, closed),
+            false => f64::INFINITY,
         };
         let is_yellow = |(_, colour, _): &(_, LightState, _)| *colour == LightState::Yellow;
         let red = most(&[LightState::Red]);
@@ -133,7 +131,7 @@ impl<'a> Road<'a> {
                 true => most(&[LightState::Red, LightState::Yellow]),
                 false => red,
             },
-            yields: false,
+            gives_way: f64::INFINITY,
             turns: on.is_some_and(|on| is_at_junction(streets, on)),
             is_free: OnceCell::new(),
             drives,
@@ -146,7 +144,7 @@ impl<'a> Road<'a> {
         Self {
             most: self.most.min(most),
             calm: self.calm.min(most),
-            yields: most.is_finite(),
+            gives_way: most,
             ..self
         }
     }
@@ -170,14 +168,15 @@ impl<'a> Road<'a> {
 
     /// By how much a move is beyond what drivers do, metres per second; 0 for one that they make.
     ///
-    /// `has_room` says whether the vehicle sees nothing to slow down for, or to stand for. At a junction
-    /// its log may be as slow for a reason that it does not see (`as_logged`); elsewhere it would learn
-    /// to slow down for nothing.
+    /// `has_room` says whether the vehicle sees nothing to slow down for, or to stand for. `logged` is the
+    /// speed of its log here, metres per second, if it is on its log's way. No bend is too sharp for that;
+    /// and at a junction the log may be as slow for a reason that the vehicle does not see. Elsewhere it
+    /// would learn to slow down for nothing.
     pub(super) fn fault(
         &self,
         now: &Shown,
         step: &Pose,
-        as_logged: bool,
+        logged: Option<f64>,
         has_room: impl Fn() -> bool,
     ) -> f64 {
         if !self.drives {
@@ -190,7 +189,16 @@ impl<'a> Road<'a> {
         let body = (-lost - GAINS_MPS).max(0.0)
             + (lost - LOSES_MPS).max(0.0)
             + (next * turn - SIDEWAYS_MPS).max(0.0);
-        let bend = (next - self.most).min(BRAKES_MPS - lost).max(0.0);
+        let is_fast = next > self.most;
+        let most = match logged {
+            Some(logged) if is_fast && next < logged + AS_LOGGED_MPS => {
+                let closed = [LightState::Red];
+                let most = most_speed(self.streets, self.lights, now, STRAIGHT_ON, &closed);
+                most.min(self.gives_way)
+            }
+            _ => self.most,
+        };
+        let bend = (next - most).min(BRAKES_MPS - lost).max(0.0);
         let stands = speed * TOKEN_DT <= CREEPS_M;
         let is_free = || {
             let of_road = || match self.on {
@@ -200,9 +208,10 @@ impl<'a> Road<'a> {
             };
             *self
                 .is_free
-                .get_or_init(|| !self.yields && of_road() && has_room())
+                .get_or_init(|| self.gives_way.is_infinite() && of_road() && has_room())
         };
-        let is_free = || !(as_logged && self.turns) && is_free();
+        let as_slow = logged.is_some_and(|logged| next > logged - AS_LOGGED_MPS);
+        let is_free = || !(as_slow && self.turns) && is_free();
         let slow = match lost > SLOWS_MPS && turn <= STRAIGHT && is_free() {
             true => lost - SLOWS_MPS,
             false => 0.0,
@@ -217,6 +226,25 @@ impl<'a> Road<'a> {
         };
         body + bend + slow + stays + astray
     }
+}
+
+/// The greatest speed of a vehicle for what is ahead, on the lane that allows most: in a junction lanes
+/// lie upon each other, and it may be on any of them. Lights of these colours are closed.
+fn most_speed(
+    streets: &MapGraph,
+    lights: &Lights,
+    now: &Shown,
+    limits: BendLimits,
+    closed: &[LightState],
+) -> f64 {
+    let entering = |lane: &Lane, metres: f64| {
+        let light = before_light(now, lane, metres, lights, closed);
+        light.min(before_sign(streets, now, lane, metres))
+    };
+    let of =
+        |(lane, at, _): (&Lane, f64, f64)| approach_speed(streets, lane, at, limits, &entering);
+    let speeds = lanes_under(streets, now.pose).map(of);
+    speeds.reduce(f64::max).unwrap_or(f64::INFINITY)
 }
 
 fn is_at_junction(streets: &MapGraph, (lane, at): (&Lane, f64)) -> bool {
@@ -382,7 +410,7 @@ mod tests {
         let now = Shown::first(BODY, Pose::new(x, 0.0, 0.0), dvec2(speed, 0.0));
         let step = Pose::new(next * TOKEN_DT, 0.0, turn);
         let lights = Lights::default();
-        Road::ahead_of(&now, false, streets, &lights).fault(&now, &step, false, || true)
+        Road::ahead_of(&now, false, streets, &lights).fault(&now, &step, None, || true)
     }
 
     #[test]
@@ -396,7 +424,7 @@ mod tests {
             let by_lane = [2, 4].map(|lane| (LaneId(lane), colour, None)).to_vec();
             let lights = Lights { by_lane };
             let road = Road::ahead_of(&now, false, &map, &lights);
-            road.fault(&now, &Pose::new(next * TOKEN_DT, 0.0, 0.0), false, || false)
+            road.fault(&now, &Pose::new(next * TOKEN_DT, 0.0, 0.0), None, || false)
         };
         let red = |x: f64, speeds| at((x, 0.0), speeds, LightState::Red);
         // The front is 18 m from the line: 10.4 m/s are the most.
@@ -430,13 +458,13 @@ mod tests {
     fn what_its_log_does_in_a_junction_has_a_reason() {
         let map = junction();
         let lights = Lights::default();
-        let stays = |x: f64, as_logged: bool| {
+        let stays = |x: f64, logged: Option<f64>| {
             let now = Shown::first(BODY, Pose::new(x, 0.0, 0.0), dvec2(0.0, 0.0));
             let road = Road::ahead_of(&now, false, &map, &lights);
-            road.fault(&now, &Pose::IDENTITY, as_logged, || true) > 0.0
+            road.fault(&now, &Pose::IDENTITY, logged, || true) > 0.0
         };
-        assert!(stays(75.0, false) && !stays(75.0, true));
-        assert!(stays(30.0, false) && stays(30.0, true));
+        assert!(stays(75.0, None) && !stays(75.0, Some(0.0)) && stays(75.0, Some(1.0)));
+        assert!(stays(30.0, None) && stays(30.0, Some(0.0)));
     }
 
     #[test]
@@ -472,7 +500,7 @@ mod tests {
         let at = |x: f64, (speed, next): (f64, f64), most: f64| {
             let now = Shown::first(BODY, Pose::new(x, 0.0, 0.0), dvec2(speed, 0.0));
             let road = Road::ahead_of(&now, false, &map, &lights).yielding(most);
-            road.fault(&now, &Pose::new(next * TOKEN_DT, 0.0, 0.0), false, || true)
+            road.fault(&now, &Pose::new(next * TOKEN_DT, 0.0, 0.0), None, || true)
         };
         assert!(at(40.0, (8.0, 8.0), 6.0) > 1.0 && at(40.0, (8.0, 6.0), 6.0) == 0.0);
         // In a junction it may stand for others.
@@ -519,10 +547,10 @@ mod tests {
             };
             let road = Road::ahead_of(&now, false, &map, &lights);
             assert_eq!(
-                road.fault(&now, &Pose::new(0.5, 0.0, 0.0), false, || has_room),
+                road.fault(&now, &Pose::new(0.5, 0.0, 0.0), None, || has_room),
                 0.0
             );
-            road.fault(&now, &Pose::IDENTITY, false, || has_room) > 0.0
+            road.fault(&now, &Pose::IDENTITY, None, || has_room) > 0.0
         };
         use LightState::{Green, Red};
         // In the lane, with and without room; at the line, by its light; in the junction.
@@ -548,6 +576,14 @@ mod tests {
         let at = |x: f64, speeds: (f64, f64)| fault(&map, x, speeds, 0.0);
         assert!(at(40.0, (14.0, 14.0)) > 1.9 && at(40.0, (14.0, 13.0)) > 0.9);
         assert_eq!(at(40.0, (14.0, 11.9)), 0.0);
+        // Its log is as fast, or slower.
+        let now = Shown::first(BODY, Pose::new(40.0, 0.0, 0.0), dvec2(14.0, 0.0));
+        let step = Pose::new(7.0, 0.0, 0.0);
+        let logged = |speed: f64, lights: &Lights| {
+            let road = Road::ahead_of(&now, false, &map, lights);
+            road.fault(&now, &step, Some(speed), || false)
+        };
+        assert!(logged(14.0, &Lights::default()) == 0.0 && logged(12.0, &Lights::default()) > 1.9);
         // Far enough away, or slow enough; and slowing down early is none either.
         assert!(at(10.0, (14.0, 14.0)) == 0.0 && at(40.0, (8.0, 8.0)) == 0.0);
         assert_eq!(at(20.0, (14.0, 13.0)), 0.0);

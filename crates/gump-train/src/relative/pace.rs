@@ -27,8 +27,6 @@ const SAME_M: f64 = 0.1;
 /// metres.
 const HERE_M: f64 = 0.3;
 const STANDS_M: f64 = 0.1;
-/// A move is as slow as the log up to this, metres per second.
-const AS_SLOW_MPS: f64 = 0.2;
 /// An agent is slow if it falls below this share of its log's speed and this, metres per second, ...
 const SHARE: f64 = 0.8;
 const SLOWER_MPS: f64 = 0.5;
@@ -88,9 +86,9 @@ impl Pace {
         })
     }
 
-    /// Whether a move is no slower than its log is here.
-    pub(super) fn is_as_logged(&self, step: &Pose) -> bool {
-        step.position.length() / TOKEN_DT > self.speed - AS_SLOW_MPS
+    /// Speed of its log here, metres per second.
+    pub(super) fn logged(&self) -> f64 {
+        self.speed
     }
 
     /// By how much a move is slower or faster than that, metres per second; `others` are all other agents
@@ -306,17 +304,6 @@ mod tests {
         // Later, also a little behind.
         assert!(stays(7, 10.1) > 0.2 && stays(7, 9.0) > 0.7);
         assert_eq!(fault(&log, 7, car((9.0, 0.0), 0.0), 0.8), 0.0);
-    }
-
-    #[test]
-    fn who_is_as_slow_as_its_log_has_a_reason() {
-        let log = log(&QUEUED);
-        let is_as_logged = |t: usize, next: f64| {
-            let pace = Pace::of_log(&log, t, &car((10.0, 0.0), 0.0), f64::INFINITY);
-            pace.unwrap()
-                .is_as_logged(&Pose::new(next * TOKEN_DT, 0.0, 0.0))
-        };
-        assert!(is_as_logged(2, 0.0) && !is_as_logged(4, 0.0) && is_as_logged(4, 0.9));
     }
 
     #[test]
