@@ -33,7 +33,7 @@ pub enum Measure {
     Standing,
     /// A vehicle that moves slowly in the present stands at a given time.
     ComeToRest,
-    /// Speed, at a given time, of an agent that moves in the present, metres per second.
+    /// Speed, at a given time, of an agent that does not stand in the present, metres per second.
     Speed,
     /// Lights of crossing approaches are green at the same time.
     ConflictingGreen,
@@ -107,7 +107,7 @@ impl Measure {
             Self::FreeRoadStanding => "vehicle that moves",
             Self::NewOverlap | Self::Standing => "agent",
             Self::ComeToRest => "vehicle that moves slowly",
-            Self::Speed => "agent that moves",
+            Self::Speed => "agent that did not stand",
             Self::HardAcceleration | Self::SetOff => "minute",
             Self::LightChange => "minute of a light",
             Self::LightRed => "time of a light",

@@ -12,8 +12,8 @@ pub(crate) const CROSSWALK_DEPTH: f64 = 3.2;
 pub(crate) const STOP_GAP: f64 = 1.3;
 /// From the crosswalk to the rounding of the curb, metres. Chosen by eye.
 const CURB_GAP: f64 = 0.5;
-/// Least length of the driveway of a car park between its junctions, and of the far one, metres. Chosen
-/// by hand.
+/// What the driveway of a car park keeps for itself and for the junction behind it, metres. Chosen by
+/// hand.
 const DRIVEWAY_M: f64 = 4.5;
 
 /// One road end at a junction, seen looking away from the junction.

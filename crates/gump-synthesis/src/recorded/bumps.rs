@@ -14,7 +14,8 @@ use crate::plan::Plan;
 const SCENES: f64 = 0.9;
 /// Share of the roads of such a scene that have them.
 const ROADS: f64 = 0.7;
-/// Roads with a higher limit have none, m/s.
+/// Roads with a higher limit have none, m/s: a quarter of the recorded vehicles pass at over 17 m/s, and
+/// these limits are above the speeds.
 const FASTEST: f64 = 30.0;
 /// Metres of road without bumps at its ends.
 const ENDS: f64 = 14.0;

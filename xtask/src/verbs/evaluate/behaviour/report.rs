@@ -41,7 +41,7 @@ const CHARTS: [Chart; 5] = [
     ),
     (
         "speeds",
-        "mean speed of agents that move in the present, m/s, with 95 % intervals over scenarios",
+        "mean speed of agents that do not stand in the present, m/s, with 95 % intervals over scenarios",
         |measure| measure == Measure::Speed,
     ),
     (
