@@ -2,10 +2,11 @@
 //! signals produce them, and leave where they drive out of it or where the map ends.
 //!
 //! There is one window around the start of the scene, and another around the ego once it has moved
-//! away from there.
+//! away from there. As soon as the start is outside of that, it is left behind. Where the ego leaves
+//! the map its window stays at the end.
 //!
-//! On average the number of agents stays as at the start. Agents do not appear or vanish in sight
-//! of the ego, except where their lane ends.
+//! On average the number of agents per metre of lane stays as at the start. Agents do not appear or
+//! vanish in sight of the ego, except where their lane ends.
 
 use std::collections::BTreeMap;
 
@@ -41,7 +42,8 @@ const KINDS: [AgentKind; 3] = AgentKind::MOVING;
 // Chosen by hand. Result 23 has the number of agents and the films that they lead to together; none
 // was tuned by itself.
 
-/// Usual speeds of moving agents, metres per second, where the scene shows none.
+/// Usual speeds, metres per second, where the scene shows no agents; of those that it shows at least
+/// half of these are assumed, since all may wait at the present.
 const USUAL_SPEED: [f64; 3] = [7.0, 1.3, 4.5];
 /// Share of the window's width that an entering agent crosses: 1 is a path through the middle;
 /// others cut a corner or turn off.
@@ -52,6 +54,8 @@ const MOVED_M: f64 = 20.0;
 /// An agent that is this far outside the window and moves away leaves, metres: not just where
 /// others enter.
 const BEYOND_M: f64 = 12.0;
+/// The ego is off the map if no lane is this near, metres: wider than a road with its shoulder.
+const OFF_MAP_M: f64 = 15.0;
 /// Sampling distance along lanes, metres: shorter crossings of the border are missed.
 const STEP_M: f64 = 5.0;
 /// Agents this many windows away leave, even if they do not move: 200 m.
@@ -110,9 +114,15 @@ pub(crate) struct Flow {
     gates: Vec<Gate>,
     /// Position of the ego when the gates were determined.
     looked_at: DVec2,
+    /// The start, until the ego has left it behind.
+    start: Option<DVec2>,
     /// The centres of the windows: the start, and the ego if it has moved on.
     centres: Vec<DVec2>,
-    /// Number of agents of each kind in the window at the start, and the speeds of the moving ones.
+    /// Metres of lanes in each window, and in that of the start at first.
+    lanes_m: Vec<f64>,
+    lanes_at_start_m: f64,
+    /// Number of agents of each kind in the window at the start, and their mean speeds, with those
+    /// that wait: as many cross the border as their number times their speed.
     usual: [f64; 3],
     speed: [f64; 3],
     /// Extents of the agents at the start.
@@ -145,7 +155,10 @@ impl Flow {
             time: 0.0,
             gates: gates(scene.map, &[ego], ego, config),
             looked_at: ego,
+            start: Some(ego),
             centres: vec![ego],
+            lanes_m: Vec::new(),
+            lanes_at_start_m: 0.0,
             usual: [0.0; 3],
             speed: USUAL_SPEED,
             sizes: Default::default(),
@@ -157,41 +170,49 @@ impl Flow {
                 .max()
                 .unwrap_or(0),
         };
+        this.lanes_m = lane_metres(scene.map, &this.centres, config.window_m);
+        this.lanes_at_start_m = this.lanes_m[0];
         this.usual = this.count(scene.map, now, scene.ego)[0];
         for (k, kind) in KINDS.into_iter().enumerate() {
             let of = now.agents().iter().filter(|agent| agent.kind == kind);
             let others = of.filter(|agent| agent.id != scene.ego);
-            let sizes = others.clone().map(|a| [a.length, a.width, a.height]);
-            this.sizes[k] = sizes.collect();
-            let moving: Vec<f64> = others
-                .map(|agent| agent.state.speed())
-                .filter(|speed| *speed > 0.5)
-                .collect();
-            if !moving.is_empty() {
-                let mean = moving.iter().sum::<f64>() / moving.len() as f64;
+            this.sizes[k] = others.map(|a| [a.length, a.width, a.height]).collect();
+            let taking_part = this.taking_part(scene.map, now, scene.ego);
+            let of_kind = taking_part.filter(|(_, kind, _)| *kind == k);
+            let speeds: Vec<f64> = of_kind.map(|(.., speed)| speed).collect();
+            if !speeds.is_empty() {
+                let mean = speeds.iter().sum::<f64>() / speeds.len() as f64;
                 this.speed[k] = mean.max(USUAL_SPEED[k] / 2.0);
             }
         }
         (!this.gates.is_empty()).then_some(this)
     }
 
-    /// Agents that take part in traffic, by nearest window and kind; parked vehicles do not.
-    fn count(&self, map: &MapGraph, frame: &Frame, ego: AgentId) -> Vec<[f64; 3]> {
-        let mut counts = vec![[0.0; 3]; self.centres.len()];
-        for agent in frame.agents().iter().filter(|agent| agent.id != ego) {
-            let at = agent.state.pose.position;
-            let Some(kind) = index_of(agent.kind) else {
-                continue;
-            };
+    /// Nearest window, kind and speed of the agents that take part in traffic; parked vehicles do not.
+    fn taking_part<'a>(
+        &'a self,
+        map: &'a MapGraph,
+        frame: &'a Frame,
+        ego: AgentId,
+    ) -> impl Iterator<Item = (usize, usize, f64)> + 'a {
+        let others = frame.agents().iter().filter(move |agent| agent.id != ego);
+        others.filter_map(move |agent| {
+            let (at, speed) = (agent.state.pose.position, agent.state.speed());
+            let kind = index_of(agent.kind)?;
             let is_parked = || {
-                agent.kind == AgentKind::Vehicle
-                    && agent.state.speed() < 0.5
-                    && map.lanes_near(at, 1.5).next().is_none()
+                let is_slow = agent.kind == AgentKind::Vehicle && speed < 0.5;
+                is_slow && map.lanes_near(at, 1.5).next().is_none()
             };
             let (window, distance) = nearest(&self.centres, at);
-            if distance <= self.config.window_m && !is_parked() {
-                counts[window][kind] += 1.0;
-            }
+            (distance <= self.config.window_m && !is_parked()).then_some((window, kind, speed))
+        })
+    }
+
+    /// Their numbers, by window and kind.
+    fn count(&self, map: &MapGraph, frame: &Frame, ego: AgentId) -> Vec<[f64; 3]> {
+        let mut counts = vec![[0.0; 3]; self.centres.len()];
+        for (window, kind, _) in self.taking_part(map, frame, ego) {
+            counts[window][kind] += 1.0;
         }
         counts
     }
@@ -210,13 +231,16 @@ impl Flow {
             return (Vec::new(), Vec::new());
         };
         let centre = driven.state.pose.position;
-        if centre.distance(self.looked_at) > MOVED_M {
+        let is_on_map = || map.lanes_near(centre, OFF_MAP_M).next().is_some();
+        if centre.distance(self.looked_at) > MOVED_M && is_on_map() {
             self.looked_at = centre;
-            self.centres.truncate(1);
-            if centre.distance(self.centres[0]) > MOVED_M {
-                self.centres.push(centre);
-            }
+            let is_near = |start: &DVec2| start.distance(centre) <= self.config.window_m;
+            self.start = self.start.filter(is_near);
+            let is_here = |start: DVec2| start.distance(centre) <= MOVED_M;
+            let own = (!self.start.is_some_and(is_here)).then_some(centre);
+            self.centres = self.start.into_iter().chain(own).collect();
             self.gates = gates(map, &self.centres, centre, &self.config);
+            self.lanes_m = lane_metres(map, &self.centres, self.config.window_m);
         }
         let others = frame.agents().iter().filter(|agent| agent.id != ego);
         let leave: Vec<AgentId> = others
@@ -273,7 +297,7 @@ impl Flow {
         let k = gate.kind;
         let is_beside = |other: &&Gate| (other.kind, other.window) == (k, gate.window);
         let same = self.gates.iter().filter(is_beside).count() as f64;
-        let usual = self.usual[k] * self.own_share();
+        let usual = self.usual[k] * self.lanes_m[gate.window] / self.lanes_at_start_m.max(1.0);
         if usual == 0.0 {
             return None;
         }
@@ -321,15 +345,6 @@ impl Flow {
                 velocity: gate.pose.direction() * speed,
             },
         })
-    }
-
-    /// The share of a window that is nearer to its own centre than to the other's.
-    fn own_share(&self) -> f64 {
-        let [start, ego] = self.centres[..] else {
-            return 1.0;
-        };
-        let x = (start.distance(ego) / (2.0 * self.config.window_m)).min(1.0);
-        1.0 - (x.acos() - x * (1.0 - x * x).sqrt()) / std::f64::consts::PI
     }
 
     /// Traffic density at a gate relative to its mean: high in a platoon, low between platoons.
@@ -419,6 +434,25 @@ fn nearest(centres: &[DVec2], at: DVec2) -> (usize, f64) {
     let each = centres.iter().map(|centre| centre.distance(at)).enumerate();
     each.min_by(|a, b| a.1.total_cmp(&b.1))
         .unwrap_or((0, f64::INFINITY))
+}
+
+/// Metres of lanes for motor traffic in the windows around these centres, each metre in the nearest.
+fn lane_metres(map: &MapGraph, centres: &[DVec2], radius: f64) -> Vec<f64> {
+    let mut metres = vec![0.0; centres.len()];
+    for (window, centre) in centres.iter().enumerate() {
+        for lane in map.lanes_in_square(*centre, radius) {
+            if lane.kind == LaneKind::BikeLane {
+                continue;
+            }
+            let length = lane.centerline.length();
+            let n = (length / STEP_M).ceil().max(1.0);
+            let place = |i: usize| length * (i as f64 + 0.5) / n;
+            let places = (0..n as usize).map(|i| lane.centerline.pose_at(place(i)).position);
+            let is_own = |at: &DVec2| matches!(nearest(centres, *at), (of, m) if of == window && m <= radius);
+            metres[window] += places.filter(is_own).count() as f64 * length / n;
+        }
+    }
+    metres
 }
 
 /// The places where lanes enter the windows around these centres, and where pedestrians walk beside
@@ -598,5 +632,57 @@ mod tests {
             speed("red")
         );
         assert!(speed("green").is_infinite());
+    }
+
+    #[test]
+    fn the_window_follows_the_ego_as_far_as_there_is_a_map() {
+        // Two lanes from the start on, one beyond it.
+        let text = "lane 1: -400,0 0,0 next 2\nlane 2: 0,0 400,0\nlane 3: -400,4 0,4\n\
+                    ego vehicle 0: 0,0\nagent vehicle 1: -60,0 velocity 10,0";
+        let scenario = fixture::scenario(text).unwrap();
+        let scene = scenario.present();
+        let mut flow = Flow::begin(&Arrivals::default(), scene, Seed(0)).unwrap();
+        let mut ego = *scene.ego_now();
+        let mut at = |x: f64| {
+            ego.state.pose.position = dvec2(x, 0.0);
+            flow.step(
+                &scenario.map,
+                &Frame::new(vec![ego], Vec::new()),
+                ego.id,
+                0.5,
+            );
+            let centres: Vec<f64> = flow.centres.iter().map(|centre| centre.x).collect();
+            let lanes: Vec<f64> = flow
+                .lanes_m
+                .iter()
+                .map(|m| (m / 10.0).round() * 10.0)
+                .collect();
+            (centres, lanes)
+        };
+        assert_eq!(at(10.0), (vec![0.0], vec![330.0]));
+        // Each metre is in the nearest window.
+        assert_eq!(at(60.0), (vec![0.0, 60.0], vec![250.0, 140.0]));
+        // The start is left behind, even if the ego returns.
+        assert_eq!(at(200.0), (vec![200.0], vec![220.0]));
+        assert_eq!(at(50.0).0, [50.0]);
+        // Off the map.
+        assert_eq!(at(395.0).0, [395.0]);
+        assert_eq!(at(500.0), (vec![395.0], vec![120.0]));
+    }
+
+    #[test]
+    fn as_many_enter_as_would_cross_the_window_at_the_speed_of_all() {
+        let speed = |moving: &str| {
+            let text = format!("lane 1: -200,0 200,0\nego vehicle 0: 0,0\n{moving}");
+            let scenario = fixture::scenario(&text).unwrap();
+            let flow = Flow::begin(&Arrivals::default(), scenario.present(), Seed(0)).unwrap();
+            (flow.usual[0], flow.speed[0])
+        };
+        let one = "agent vehicle 1: -60,0 velocity 12,0";
+        assert_eq!(speed(one), (1.0, 12.0));
+        // One that waits counts, one that is parked does not.
+        assert_eq!(speed(&format!("{one}\nagent vehicle 2: 30,0")), (2.0, 6.0));
+        assert_eq!(speed(&format!("{one}\nagent vehicle 2: 30,4")), (1.0, 12.0));
+        assert_eq!(speed("agent vehicle 2: 30,0"), (1.0, USUAL_SPEED[0] / 2.0));
     }
 }

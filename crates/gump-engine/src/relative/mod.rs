@@ -1,7 +1,10 @@
 //! Rollouts of the relative network: CPU implementation, memory of agents, sampling rules, and the
 //! world.
 
+pub mod approach;
 pub mod engine;
+pub mod keep_clear;
+pub mod right_of_way;
 pub mod rules;
 pub mod seen;
 mod waiting;

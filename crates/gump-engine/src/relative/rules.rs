@@ -1,5 +1,6 @@
-//! Sampling rules for the relative network: moves that would overlap an agent, leave the road or
-//! run a red light are redrawn, and kinematically impossible moves are limited.
+//! Sampling rules for the relative network: moves that would overlap an agent, leave the road, run a
+//! red light, lead into an occupied junction or take the right of way are redrawn, and kinematically
+//! impossible moves are limited.
 //!
 //! They are those of the sequence network (`rejection`, `kinematic_limits`). That network predicts
 //! three poses at once; here the second part of the checked horizon, one second, continues the
@@ -7,14 +8,16 @@
 
 use gump_geometry::{DVec2, Polyline, Pose, angle_difference};
 use gump_model::local_context::LaneMap;
-use gump_model::relative::graph::Shown;
+use gump_model::relative::graph::{Lights, Shown};
 use gump_model::steps::TOKEN_DT;
 use gump_scene::{
-    AgentKind, AgentState, LaneId, Light, LightState, MapGraph, stop_line, ways_beyond,
+    AgentKind, AgentState, Lane, LaneId, Light, LightState, MapGraph, stop_line, ways_beyond,
 };
 
 use crate::kinematic_limits::Limits;
 use crate::rejection::{BRAKING, Footprints, Member, POSES, Way, way};
+use crate::relative::keep_clear::closed_entry;
+use crate::relative::right_of_way::{Course, courses, yielding_speed};
 
 // The thresholds are chosen by hand; none has been varied in a measurement.
 
@@ -35,6 +38,9 @@ const TURNS_AT_RED: f64 = 2.0;
 const GENTLY: f64 = 4.0;
 /// ... and never exceeds this, below the 8 of a dry road: a vehicle that would need more drives on.
 const HARDEST: f64 = 6.0;
+
+/// Beyond the place where it could stop, a vehicle looks this far for a junction, metres.
+const LOOK_M: f64 = 2.0;
 
 /// Share of a turn that is left in the next step of a predicted path. Of the logged moves of SUMO's
 /// training scenes 0.49 % would be redrawn, with 1 (the turn goes on) 0.68, with 0 0.84 (result 32).
@@ -91,6 +97,17 @@ impl StopLine {
         lights.iter().filter_map(of).collect()
     }
 
+    /// The line at the end of a lane that leads into a junction.
+    fn at_end(lane: &Lane) -> Self {
+        let way = &lane.centerline;
+        Self {
+            lane: lane.id,
+            line: way.pose_at(way.length()),
+            width: lane.width,
+            is_right: false,
+        }
+    }
+
     /// The remaining distance of a front bumper to the line, metres.
     fn room(&self, now: &Shown) -> f64 {
         let local = self.line.inverse() * now.pose.position;
@@ -140,7 +157,7 @@ fn slowed(now: &Shown, step: Pose, room: f64) -> Pose {
 }
 
 /// Whether an agent with this move runs a red light: every line that it crosses is red.
-pub(super) fn runs_red(now: &Shown, step: Pose, lines: &[(&StopLine, LightState)]) -> bool {
+fn runs_red(now: &Shown, step: Pose, lines: &[(&StopLine, LightState)]) -> bool {
     let stopped = now.velocity().length() < TURNS_AT_RED;
     let crossed = crossed(now, step, lines);
     let mut shut = crossed
@@ -150,20 +167,90 @@ pub(super) fn runs_red(now: &Shown, step: Pose, lines: &[(&StopLine, LightState)
     first.is_some_and(|first| first && shut.all(|shut| shut))
 }
 
-/// Redraws moves of vehicles over a red light, up to `redraws` times each; a vehicle without
-/// another move brakes, if that stops it.
-pub(super) fn obey_lights(
+/// The lines that vehicles may not cross.
+pub(super) struct Shut<'l> {
+    /// Those of lights, and what they show.
+    lights: Vec<(&'l StopLine, LightState)>,
+    /// Those before occupied junctions, by agent.
+    entries: Vec<Option<StopLine>>,
+    /// The greatest speed for those that have the right of way, by agent, metres per second.
+    most: Vec<f64>,
+}
+
+impl<'l> Shut<'l> {
+    /// For agents with these lights, which show these colours. `unheeded` is one for which nobody waits.
+    pub(super) fn of(
+        map: &MapGraph,
+        agents: &[Shown],
+        unheeded: Option<usize>,
+        lights: impl Iterator<Item = (&'l StopLine, LightState)>,
+        colours: &Lights,
+    ) -> Self {
+        let is_lit = |lane| colours.colour(lane).is_some();
+        let counts = |i: usize| unheeded != Some(i);
+        let entry = |i: usize| {
+            let speed = agents[i].velocity().length();
+            let stop = speed * speed / (2.0 * GENTLY) + speed * TOKEN_DT;
+            let reach = stop + agents[i].body.length / 2.0 + LOOK_M;
+            let (lane, _) = closed_entry(map, agents, i, reach, is_lit, counts)?;
+            Some(StopLine::at_end(lane))
+        };
+        let ways = |i: usize| match agents[i].body.kind {
+            AgentKind::Vehicle | AgentKind::Bicycle if counts(i) => {
+                courses(map, colours, &agents[i])
+            }
+            _ => Vec::new(),
+        };
+        let ways: Vec<Vec<Course>> = (0..agents.len()).map(ways).collect();
+        let most = |i: usize| {
+            let others = ways.iter().enumerate().filter(|(j, _)| *j != i);
+            yielding_speed(&ways[i], &others.map(|(_, way)| &way[..]))
+        };
+        Self {
+            lights: lights.collect(),
+            entries: (0..agents.len()).map(entry).collect(),
+            most: (0..agents.len()).map(most).collect(),
+        }
+    }
+
+    /// Whether an agent crosses one with this move, or takes another's right of way.
+    pub(super) fn forbids(&self, agents: &[Shown], i: usize, step: Pose) -> bool {
+        let now = &agents[i];
+        let entry = self.entries[i].as_ref();
+        entry.is_some_and(|line| line.is_crossed(now, step))
+            || runs_red(now, step, &self.lights)
+            || step.position.length() / TOKEN_DT > self.yielding(now, i)
+    }
+
+    /// The greatest speed of an agent for others, metres per second: it brakes no harder than
+    /// [`GENTLY`].
+    fn yielding(&self, now: &Shown, i: usize) -> f64 {
+        self.most[i].max(now.velocity().length() - GENTLY * TOKEN_DT)
+    }
+
+    /// The remaining distance to the first one that it crosses, metres.
+    fn room(&self, now: &Shown, i: usize, step: Pose) -> f64 {
+        let lights = crossed(now, step, &self.lights).into_iter();
+        let entry = self.entries[i].as_ref();
+        let entry = entry.filter(|line| line.is_crossed(now, step));
+        let lines = lights.map(|(line, _)| line).chain(entry);
+        lines
+            .map(|line| line.room(now))
+            .fold(f64::INFINITY, f64::min)
+    }
+}
+
+/// Redraws moves of vehicles over a red light, into an occupied junction or into the way of one that has
+/// the right of way, up to `redraws` times each; a vehicle without another move brakes, if that stops it.
+pub(super) fn obey_lines(
     agents: &[Shown],
     driven: Option<usize>,
-    lines: &[(&StopLine, LightState)],
+    shut: &Shut<'_>,
     redraws: usize,
     moves: &mut [Pose],
     again: &mut Again<'_>,
 ) {
-    if lines.iter().all(|(_, state)| *state != LightState::Red) {
-        return;
-    }
-    let runs = |i: usize, step: Pose| runs_red(&agents[i], step, lines);
+    let runs = |i: usize, step: Pose| shut.forbids(agents, i, step);
     let is_bound = |i: &usize| agents[*i].body.kind == AgentKind::Vehicle && driven != Some(*i);
     let mut left: Vec<usize> = (0..agents.len())
         .filter(is_bound)
@@ -174,25 +261,30 @@ pub(super) fn obey_lights(
             return;
         }
         let drawn = again(&left, attempt);
-        let mut shut = Vec::new();
+        let mut still = Vec::new();
         for (&i, step) in left.iter().zip(drawn) {
             match runs(i, step) {
-                true => shut.push(i),
+                true => still.push(i),
                 false => moves[i] = step,
             }
         }
-        left = shut;
+        left = still;
     }
     for i in left {
         let now = &agents[i];
         let speed = now.velocity().length();
         let stands = speed < CREEPING;
         // An agent that can no longer stop before the line drives on.
-        let ahead = crossed(now, moves[i], lines);
-        let room = ahead.iter().map(|(line, _)| line.room(now));
-        let room = room.fold(f64::INFINITY, f64::min);
-        if stands || speed * speed / (2.0 * HARDEST) <= room {
+        let room = shut.room(now, i, moves[i]);
+        if room.is_finite() && (stands || speed * speed / (2.0 * HARDEST) <= room) {
             moves[i] = slowed(now, moves[i], room);
+        }
+        let (most, length) = (shut.yielding(now, i) * TOKEN_DT, moves[i].position.length());
+        if length > most {
+            moves[i] = match most < CREEPING * TOKEN_DT {
+                true => Pose::IDENTITY,
+                false => Pose::IDENTITY.interpolate(moves[i], most / length),
+            };
         }
     }
 }
@@ -310,6 +402,7 @@ fn braking(now: &Shown, step: Pose) -> Option<(Pose, Way)> {
 #[cfg(test)]
 mod tests {
     use gump_model::relative::graph::Body;
+    use gump_scene::fixture;
 
     use super::*;
 
@@ -424,6 +517,47 @@ mod tests {
         start(vec![2], &mut moves, &mut |_, _| unreachable!("it moves"));
     }
 
+    /// Lines of lights only, for one agent.
+    fn lit<'l>(lights: &[(&'l StopLine, LightState)]) -> Shut<'l> {
+        Shut {
+            lights: lights.to_vec(),
+            entries: vec![None],
+            most: vec![f64::INFINITY],
+        }
+    }
+
+    #[test]
+    fn nobody_drives_into_an_occupied_junction() {
+        let scenario = fixture::scenario(
+            "lane 1: -60,0 0,0 next 2\nlane 2: 0,0 20,0 next 3\nlane 3: 20,0 90,0\n\
+             ego vehicle 0: -20,0",
+        )
+        .unwrap();
+        let mut parts = scenario.map.parts().clone();
+        parts.lanes[1].in_intersection = true;
+        let map = MapGraph::new(parts).unwrap();
+        let moved = |across: Pose, drawn: f64| {
+            let mut other = car(0.0, 0.0);
+            other.pose = across;
+            let agents = [car(-8.0, 3.0), other];
+            let shut = Shut::of(&map, &agents, None, std::iter::empty(), &Lights::default());
+            let mut moves = [straight(5.0), Pose::IDENTITY];
+            let mut again = |who: &[usize], _: usize| vec![straight(drawn); who.len()];
+            obey_lines(&agents, None, &shut, 3, &mut moves, &mut again);
+            moves[0].position.x
+        };
+        let across = Pose::new(10.0, 1.0, std::f64::consts::FRAC_PI_2);
+        // Its front is 6 m before the line; drawn again, it is slow enough, or brakes.
+        assert_eq!(moved(across, 2.0), 2.0);
+        assert!(
+            (moved(across, 5.0) - 1.6).abs() < 0.2,
+            "{}",
+            moved(across, 5.0)
+        );
+        let beside = Pose::new(10.0, 9.0, std::f64::consts::FRAC_PI_2);
+        assert_eq!(moved(beside, 2.0), 5.0);
+    }
+
     #[test]
     fn nobody_runs_a_red_light_but_who_cannot_stop() {
         let line = StopLine {
@@ -435,7 +569,7 @@ mod tests {
         let settled = |car: Shown, step: f64, lights: &[(&StopLine, LightState)], drawn: f64| {
             let mut moves = [straight(step)];
             let mut again = |who: &[usize], _: usize| vec![straight(drawn); who.len()];
-            obey_lights(&[car], None, lights, 3, &mut moves, &mut again);
+            obey_lines(&[car], None, &lit(lights), 3, &mut moves, &mut again);
             moves[0].position.x
         };
         let red = [(&line, LightState::Red)];
@@ -487,7 +621,7 @@ mod tests {
                 for _ in 0..40 {
                     let mut moves = [straight(speed * TOKEN_DT)];
                     let mut again = |_: &[usize], _: usize| vec![straight(speed * TOKEN_DT)];
-                    obey_lights(&[now], None, &lights, 2, &mut moves, &mut again);
+                    obey_lines(&[now], None, &lit(&lights), 2, &mut moves, &mut again);
                     now = now.then(now.pose * moves[0]);
                 }
                 let front = now.pose.position.x + 2.0;

@@ -59,6 +59,9 @@ const GAP_S: f64 = 4.0;
 const NEAR_PATH_M: f64 = 1.5;
 /// ... and moves faster than this, metres per second.
 const MOVES: f64 = 0.5;
+/// In a junction patience is at most this, seconds, as long as a benchmark of 8 s does not show: who
+/// stands there stands in the way. Vehicles that hold each other there squeeze past at once.
+const INSIDE_S: f64 = 9.0;
 /// Agents that wait for each other are within this, metres, and meet at more than this angle,
 /// radians.
 const MEETING_M: f64 = 25.0;
@@ -89,12 +92,15 @@ struct Room {
 /// Returns the indices of the agents that have stood for longer than their patience and could go on.
 ///
 /// A vehicle or bicycle in a lane could if no agent is on the path ahead or about to cross it, no
-/// light forbids it, and of those whose paths meet there it has waited longest. After twice the time
-/// less room suffices between vehicles that stand across each other's paths. A pedestrian could if
+/// light forbids it, and of those whose paths meet there it has waited longest. After twice the time,
+/// in a junction at once, less room suffices between vehicles that stand across each other's paths. A pedestrian could if
 /// it stands on the path of a vehicle or bicycle that has waited as long. `agents` are all of the
 /// frame.
 pub(super) fn free_to_go(map: &MapGraph, lights: &[Light], agents: &[Standing]) -> Vec<usize> {
-    let waits = |i: &usize| agents[*i].waited_s > agents[*i].patience_s;
+    let is_patient = |one: &Standing| one.patience_s.is_infinite() || one.waited_s <= INSIDE_S;
+    let inside = |one: &Standing| !is_patient(one) && is_inside(map, &one.agent);
+    let inside: Vec<bool> = agents.iter().map(inside).collect();
+    let waits = |i: &usize| inside[*i] || agents[*i].waited_s > agents[*i].patience_s;
     let waiting: Vec<usize> = (0..agents.len()).filter(waits).collect();
     let walks = |i: usize| agents[i].agent.kind == AgentKind::Pedestrian;
     let (mut free, mut people) = (Vec::new(), Vec::new());
@@ -118,7 +124,7 @@ pub(super) fn free_to_go(map: &MapGraph, lights: &[Light], agents: &[Standing]) 
             |other: &Agent| angle_difference(agent.state.pose.heading, other.state.pose.heading);
         let crosses = |j: &usize| waits(j) && !walks(*j) && turn(&agents[*j].agent).abs() > CROSSES;
         let squeezes = || {
-            let is_long = agents[i].waited_s > 2.0 * agents[i].patience_s;
+            let is_long = inside[i] || agents[i].waited_s > 2.0 * agents[i].patience_s;
             is_long && holding.iter().all(crosses) && is_held(&TIGHT).is_empty()
         };
         if !is_shut(&reached, lights) && (holding.is_empty() || squeezes()) {
@@ -141,6 +147,12 @@ pub(super) fn free_to_go(map: &MapGraph, lights: &[Light], agents: &[Standing]) 
     next.sort_unstable();
     next.dedup();
     next
+}
+
+/// Whether an agent is on a lane of a junction.
+fn is_inside(map: &MapGraph, agent: &Agent) -> bool {
+    let mut near = map.lanes_near(agent.state.pose.position, IN_LANE_M);
+    near.next().is_some_and(|(lane, _)| lane.in_intersection)
 }
 
 /// Whether two agents' lanes ahead come within [`NEAR_PATH_M`] of each other.

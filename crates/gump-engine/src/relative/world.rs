@@ -34,7 +34,7 @@ use crate::EngineError;
 use crate::nucleus::uniform;
 use crate::relative::engine::{Draw, KEPT, MapMemory, RelativeEngine, Workspace};
 use crate::relative::rules::{
-    Driven, StopLine, kinematically_limited, obey_lights, resolve, runs_red, start,
+    Driven, Shut, StopLine, kinematically_limited, obey_lines, resolve, start,
 };
 use crate::relative::seen::{FrameIndex, ObservedAgent, add_presents};
 use crate::relative::waiting::{Standing, free_to_go};
@@ -648,13 +648,21 @@ impl Future {
             let i = lights.binary_search_by_key(&line.lane, |light| light.lane);
             Some((line, lights[i.ok()?].state))
         });
-        let lines: Vec<_> = lines.collect();
-        obey_lights(&agents, driven, &lines, redraws, &mut moves, &mut again);
-        // Redraws that keep agents clear of others must not make them run a red light.
+        let colours = Lights {
+            by_lane: self
+                .lights_now
+                .iter()
+                .map(|light| (light.lane, light.state, None))
+                .collect(),
+        };
+        let unheeded = driven.filter(|_| !sampling.yields_to_driven);
+        let shut = Shut::of(&self.scene.source, &agents, unheeded, lines, &colours);
+        obey_lines(&agents, driven, &shut, redraws, &mut moves, &mut again);
+        // Redraws that keep agents clear of others must not make them cross such a line.
         let kept = moves.clone();
         let mut lawful = |who: &[usize], attempt: usize| -> Vec<Pose> {
             let drawn = who.iter().zip(again(who, attempt));
-            let held = drawn.map(|(&i, step)| match runs_red(&agents[i], step, &lines) {
+            let held = drawn.map(|(&i, step)| match shut.forbids(&agents, i, step) {
                 true => kept[i],
                 false => step,
             });

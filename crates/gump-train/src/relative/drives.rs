@@ -13,9 +13,12 @@
 //! stop sign, so these stay where the log has them. Nor do they say where vehicles slow down: rules
 //! prefer slow draws, which the network would learn from everywhere. Nor that no way out is left to a
 //! vehicle that comes to a bend too fast, or to a junction before others. So moves with such faults
-//! are drawn again (`faults`, `right_of_way`, `pace`).
+//! are drawn again (`faults`, `right_of_way`, `pace`), and those into a junction that is occupied.
 
+use gump_engine::relative::approach::before_line;
 use gump_engine::relative::engine::{Draw, RelativeEngine, Workspace};
+use gump_engine::relative::keep_clear::closed_entry;
+use gump_engine::relative::right_of_way::{Course, courses, yielding_speed};
 use gump_engine::relative::rules::resolve;
 use gump_engine::relative::seen::{FrameIndex, ObservedAgent, add_presents};
 use gump_geometry::{DVec2, Pose, angle_difference};
@@ -34,7 +37,6 @@ use crate::TrainError;
 use crate::relative::crowd::Crowd;
 use crate::relative::faults::{Road, sign_lines};
 use crate::relative::pace::Pace;
-use crate::relative::right_of_way::{Course, courses, yielding_speed};
 
 /// Frames that are shown as logged before the network drives: one move, so that it has seen agents
 /// move.
@@ -55,6 +57,9 @@ const WAITS_M: f64 = 0.2;
 /// metres. All were chosen by hand.
 const LINE_AHEAD_M: f64 = 60.0;
 const LINE_ASIDE_M: f64 = 6.0;
+/// Distance within which a vehicle slows down before an occupied junction, metres: what `faults` needs
+/// to stop from 15 m/s. Chosen by hand.
+const ENTRY_M: f64 = 40.0;
 /// A move with a fault is drawn again so many times. Chosen by hand.
 const FAULT_REDRAWS: usize = 6;
 /// Radius around a sample in which road edges are considered, metres. Chosen by hand.
@@ -256,13 +261,18 @@ impl TrackDriver for NetworkDriver {
                     let others = ways.iter().enumerate().filter(|(j, _)| *j != i);
                     yielding_speed(&ways[i], &others.map(|(_, way)| &way[..]))
                 };
+                let is_lit = |lane| lights.colour(lane).is_some();
+                let keeps_clear = |i: usize| {
+                    let closed = closed_entry(streets, &agents, i, ENTRY_M, is_lit, |_| true);
+                    closed.map_or(f64::INFINITY, |(_, m)| before_line(&agents[i], m, 0.0))
+                };
                 let mut given = Vec::new();
                 let (mut roads, mut paces) = (Vec::new(), Vec::new());
                 for (i, (&a, now)) in here.iter().zip(&agents).enumerate() {
                     let stays = stays[a] || is_queued(a, now);
                     let mut road = Road::ahead_of(now, stays, streets, lights);
                     if !stays {
-                        road = road.yielding(yields(i));
+                        road = road.yielding(yields(i).min(keeps_clear(i)));
                     }
                     let is_parked = || stood[a] && road.is_away_from_junctions() && has_room(i);
                     let stays = stays || is_parked();

@@ -9,8 +9,10 @@
 //! is drawn again, which makes it start sooner or later.
 
 use std::cell::OnceCell;
-use std::f64::consts::FRAC_PI_6;
 
+use gump_engine::relative::approach::{
+    BRAKES_MPS2, before_line, has_sign, lane_under, lanes_under,
+};
 use gump_geometry::{Pose, angle_difference};
 use gump_model::relative::graph::{Lights, Shown};
 use gump_model::steps::TOKEN_DT;
@@ -25,12 +27,9 @@ use gump_scene::{
 const SLOWS_MPS: f64 = 0.4;
 /// ... on a straight path: if it turns no more than this in the step, radians, ...
 const STRAIGHT: f64 = 0.06;
-/// ... for no reason if it is on a lane, with its centre within this distance and heading along it
-/// within this angle, ...
-const IN_LANE_M: f64 = 1.0;
-const IN_LANE: f64 = FRAC_PI_6;
-/// ... that goes on for this distance without a junction or a stop sign, metres, sees nothing else
-/// (`View::has_room`), and is not faster than drivers like to be before a bend.
+/// ... for no reason if it is on a lane that goes on for this distance without a junction or a stop
+/// sign, metres, sees nothing else (`View::has_room`), and is not faster than drivers like to be before
+/// a bend.
 const FREE_M: f64 = 35.0;
 const EASY: BendLimits = BendLimits {
     lateral_mps2: 2.5,
@@ -40,7 +39,7 @@ const EASY: BendLimits = BendLimits {
 /// What hardly a driver exceeds. A vehicle that is faster than this allows loses ...
 const HARD: BendLimits = BendLimits {
     lateral_mps2: 4.0,
-    braking_mps2: 3.0,
+    braking_mps2: BRAKES_MPS2,
     ahead_m: 60.0,
 };
 /// The same where bends do not count.
@@ -52,10 +51,6 @@ const STRAIGHT_ON: BendLimits = BendLimits {
 const BRAKES_MPS: f64 = 2.0;
 /// A move is as fast as the log, or as slow, up to this, metres per second.
 const AS_LOGGED_MPS: f64 = 0.2;
-/// A vehicle that would have to brake harder than this for a red light drives on, m/s². The distance
-/// that its front may be over the line and it still waits, metres.
-const HARDEST_MPS2: f64 = 6.0;
-pub(super) const OVER_M: f64 = 0.5;
 /// A right turn at red is allowed from this speed, metres per second; it turns by more than this,
 /// radians.
 const TURNS_AT_RED_MPS: f64 = 2.0;
@@ -299,22 +294,6 @@ fn before_sign(streets: &MapGraph, now: &Shown, lane: &Lane, metres: f64) -> f64
     }
 }
 
-/// The greatest speed of a vehicle before a line that it crosses at `least` metres per second at most;
-/// infinite if it is over the line, or too fast to get there.
-pub(super) fn before_line(now: &Shown, metres: f64, least: f64) -> f64 {
-    let room = metres - now.body.length / 2.0;
-    let squared = now.velocity().length_squared() - least * least;
-    if room < -OVER_M || squared > 2.0 * HARDEST_MPS2 * (room + OVER_M) {
-        return f64::INFINITY;
-    }
-    (least * least + 2.0 * HARD.braking_mps2 * room.max(0.0)).sqrt()
-}
-
-/// Whether a stop sign applies to a lane: at its start if it is in a junction, at its end otherwise.
-pub(super) fn has_sign(streets: &MapGraph, lane: &Lane) -> bool {
-    streets.stop_signs_of(lane.id).next().is_some()
-}
-
 /// Where vehicles stop for signs.
 pub(super) fn sign_lines(streets: &MapGraph) -> impl Iterator<Item = Pose> + '_ {
     let signed = streets.stop_signs().iter().flat_map(|sign| &sign.lanes);
@@ -326,23 +305,6 @@ pub(super) fn sign_lines(streets: &MapGraph) -> impl Iterator<Item = Pose> + '_ 
         } else {
             way.length()
         }))
-    })
-}
-
-/// The lane that a vehicle is on, and its distance from the start, metres.
-pub(super) fn lane_under(streets: &MapGraph, pose: Pose) -> Option<(&Lane, f64)> {
-    let on = lanes_under(streets, pose);
-    let (lane, at, _) = on.min_by(|a, b| a.2.total_cmp(&b.2))?;
-    Some((lane, at))
-}
-
-/// All lanes that it may be on, its distance from the start, and from the centre, metres.
-fn lanes_under(streets: &MapGraph, pose: Pose) -> impl Iterator<Item = (&Lane, f64, f64)> {
-    let lanes = streets.lanes_near(pose.position, IN_LANE_M);
-    lanes.filter_map(move |(lane, distance)| {
-        let at = lane.centerline.project(pose.position).arc_length;
-        let way = lane.centerline.pose_at(at).heading;
-        (angle_difference(way, pose.heading).abs() <= IN_LANE).then_some((lane, at, distance))
     })
 }
 

@@ -5,7 +5,6 @@ mod drives;
 mod faults;
 mod pace;
 mod rewards;
-mod right_of_way;
 #[cfg(test)]
 mod tests;
 mod train;

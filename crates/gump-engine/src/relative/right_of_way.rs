@@ -9,7 +9,7 @@ use gump_geometry::{DVec2, angle_difference};
 use gump_model::relative::graph::{Lights, Shown};
 use gump_scene::{Lane, LightState, MapGraph};
 
-use crate::relative::faults::{OVER_M, before_line, has_sign, lane_under};
+use crate::relative::approach::{OVER_M, before_line, has_sign, lane_under};
 
 // All were chosen by hand.
 
@@ -38,9 +38,11 @@ const TURNS: f64 = 0.5;
 const OPPOSITE: f64 = 0.8;
 
 /// A way of a vehicle along its lanes.
-pub(super) struct Course {
+pub struct Course {
     /// Every metre from its centre.
     points: Vec<DVec2>,
+    /// The least and the greatest coordinates of these.
+    bounds: (DVec2, DVec2),
     /// Direction at the start, radians, and by how much it turns, to the left above 0.
     heading: f64,
     turn: f64,
@@ -56,7 +58,7 @@ pub(super) struct Course {
 }
 
 /// The ways ahead of a vehicle that is on a lane, shortest turn first.
-pub(super) fn courses(streets: &MapGraph, lights: &Lights, now: &Shown) -> Vec<Course> {
+pub fn courses(streets: &MapGraph, lights: &Lights, now: &Shown) -> Vec<Course> {
     let Some((lane, at)) = lane_under(streets, now.pose) else {
         return Vec::new();
     };
@@ -108,8 +110,11 @@ fn course(streets: &MapGraph, lights: &Lights, now: &Shown, way: &[&Lane], at: f
         base += length;
     }
     let is_inside = way[0].in_intersection;
+    let least = points.iter().copied().fold(DVec2::INFINITY, DVec2::min);
+    let greatest = points.iter().copied().fold(DVec2::NEG_INFINITY, DVec2::max);
     Course {
         points,
+        bounds: (least, greatest),
         heading,
         turn: angle_difference(end, heading),
         line_m: line.filter(|_| !is_inside).map(|(metres, ..)| metres),
@@ -124,7 +129,7 @@ fn course(streets: &MapGraph, lights: &Lights, now: &Shown, way: &[&Lane], at: f
 /// The greatest speed of a vehicle for those that it has to let pass, metres per second: on the best of
 /// its courses. Infinite if nobody comes. `others` are the courses of each other vehicle, the likeliest
 /// first.
-pub(super) fn yielding_speed<'a>(
+pub fn yielding_speed<'a>(
     own: &[Course],
     others: &(impl Iterator<Item = &'a [Course]> + Clone),
 ) -> f64 {
@@ -225,6 +230,10 @@ impl Course {
     /// The first stretch on which two courses are beside or on each other, if they come from apart.
     fn meets(&self, other: &Self) -> Option<Meeting> {
         let near = self.beside(other);
+        let lies_beyond = |one: &Self, of: &Self| (one.bounds.0 - of.bounds.1).max_element() > near;
+        if lies_beyond(self, other) || lies_beyond(other, self) {
+            return None;
+        }
         let hits = |point: &DVec2| {
             let distance = |(j, of): (usize, &DVec2)| (of.distance_squared(*point), j);
             let nearest = other.points.iter().enumerate().map(distance);

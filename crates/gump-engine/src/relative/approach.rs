@@ -1,0 +1,55 @@
+//! What a vehicle comes to on its lane: lines at which it stops, and the lane itself.
+//!
+//! Used by the rules of sampling (`right_of_way`, `keep_clear`) and by training, which judges drives.
+
+use std::f64::consts::FRAC_PI_6;
+
+use gump_geometry::{Pose, angle_difference};
+use gump_model::relative::graph::Shown;
+use gump_scene::{Lane, MapGraph};
+
+// All were chosen by hand.
+
+/// A vehicle is on a lane if its centre is within this distance of the lane's, and it heads along it
+/// within this angle.
+const IN_LANE_M: f64 = 1.0;
+const IN_LANE: f64 = FRAC_PI_6;
+/// Hardly a driver brakes harder than this without need, m/s². One that would have to brake harder
+/// than the second for a line drives on.
+pub const BRAKES_MPS2: f64 = 3.0;
+const HARDEST_MPS2: f64 = 6.0;
+/// The distance that a vehicle's front may be over a line and it still waits, metres.
+pub const OVER_M: f64 = 0.5;
+
+/// The greatest speed of a vehicle before a line that it crosses at `least` metres per second at most;
+/// infinite if it is over the line, or too fast to get there.
+pub fn before_line(now: &Shown, metres: f64, least: f64) -> f64 {
+    let room = metres - now.body.length / 2.0;
+    let squared = now.velocity().length_squared() - least * least;
+    if room < -OVER_M || squared > 2.0 * HARDEST_MPS2 * (room + OVER_M) {
+        return f64::INFINITY;
+    }
+    (least * least + 2.0 * BRAKES_MPS2 * room.max(0.0)).sqrt()
+}
+
+/// Whether a stop sign applies to a lane: at its start if it is in a junction, at its end otherwise.
+pub fn has_sign(streets: &MapGraph, lane: &Lane) -> bool {
+    streets.stop_signs_of(lane.id).next().is_some()
+}
+
+/// The lane that a vehicle is on, and its distance from the start, metres.
+pub fn lane_under(streets: &MapGraph, pose: Pose) -> Option<(&Lane, f64)> {
+    let on = lanes_under(streets, pose);
+    let (lane, at, _) = on.min_by(|a, b| a.2.total_cmp(&b.2))?;
+    Some((lane, at))
+}
+
+/// All lanes that it may be on, its distance from the start, and from the centre, metres.
+pub fn lanes_under(streets: &MapGraph, pose: Pose) -> impl Iterator<Item = (&Lane, f64, f64)> {
+    let lanes = streets.lanes_near(pose.position, IN_LANE_M);
+    lanes.filter_map(move |(lane, distance)| {
+        let at = lane.centerline.project(pose.position).arc_length;
+        let way = lane.centerline.pose_at(at).heading;
+        (angle_difference(way, pose.heading).abs() <= IN_LANE).then_some((lane, at, distance))
+    })
+}
