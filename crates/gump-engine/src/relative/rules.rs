@@ -547,10 +547,10 @@ mod tests {
             moves[0].position.x
         };
         let across = Pose::new(10.0, 1.0, std::f64::consts::FRAC_PI_2);
-        // Its front is 6 m before the line; drawn again, it is slow enough, or brakes.
+        // Its front is 6 m before the line. Drawn again it is slow enough; else it brakes with 2.8 m/s².
         assert_eq!(moved(across, 2.0), 2.0);
         assert!(
-            (moved(across, 5.0) - 1.6).abs() < 0.2,
+            (moved(across, 5.0) - 2.31).abs() < 0.01,
             "{}",
             moved(across, 5.0)
         );
