@@ -20,9 +20,11 @@ const STANDS_MPS: f64 = 1.0;
 /// along a lane within this angle, radians.
 const ON_LANE_M: f64 = 1.5;
 const ALONG: f64 = FRAC_PI_6;
-/// Ways through a junction have at most so many lanes, and there are at most so many.
-const LANES: usize = 4;
+/// Ways to and through a junction have at most so many lanes, those through it are at most so many,
+/// and not longer than this, metres.
+const LANES: usize = 6;
 const WAYS: usize = 12;
+const LONGEST_M: f64 = 60.0;
 /// Distance between the places of a way that are looked at, and a vehicle's length there, metres.
 const STEP_M: f64 = 1.0;
 /// Space at each side of the way, and behind a vehicle that has left the junction, metres.
@@ -33,15 +35,16 @@ const BEHIND_M: f64 = 1.0;
 /// from its centre to that end, metres: on each of its ways a vehicle stands across it, or, where a light
 /// applies, anywhere before the place that it needs behind the junction.
 ///
-/// `agents` are all, `own` the index of the vehicle, `counts` says who is looked at. `None` where it may drive on, is in the junction
-/// already, or is farther than `reach` metres from it.
+/// `agents` are all, `own` the index of the vehicle, `closes` says who can close a junction: not those
+/// that are parked in it. `None` where it may drive on, is in the junction already, or is farther than
+/// `reach` metres from it.
 pub fn closed_entry<'m>(
     map: &'m MapGraph,
     agents: &[Shown],
     own: usize,
     reach: f64,
     is_lit: impl Fn(LaneId) -> bool,
-    counts: impl Fn(usize) -> bool,
+    closes: impl Fn(usize) -> bool,
 ) -> Option<(&'m Lane, f64)> {
     let now = &agents[own];
     let is_vehicle = |agent: &Shown| agent.body.kind == AgentKind::Vehicle;
@@ -53,7 +56,10 @@ pub fn closed_entry<'m>(
     let mut line = lane.centerline.length() - at;
     let front = now.body.length / 2.0;
     // The last lane before the junction; lanes that fork before it leave the choice open.
-    while line < reach && !lane.in_intersection {
+    for _ in 0..LANES {
+        if line >= reach || lane.in_intersection {
+            break;
+        }
         let mut next = map.successors(lane.id);
         let (Some(first), second) = (next.next(), next.next()) else {
             return None;
@@ -67,7 +73,8 @@ pub fn closed_entry<'m>(
         lane = first;
         line += lane.centerline.length();
     }
-    if lane.in_intersection || line >= reach || line - front < -OVER_M {
+    let leads_in = map.successors(lane.id).any(|lane| lane.in_intersection);
+    if lane.in_intersection || !leads_in || line >= reach || line - front < -OVER_M {
         return None;
     }
     let far = |agent: &Shown| {
@@ -75,7 +82,7 @@ pub fn closed_entry<'m>(
         apart > line + LONGEST_M + now.body.length + agent.body.length
     };
     let others = agents.iter().enumerate();
-    let others = others.filter(|(j, _)| *j != own && counts(*j));
+    let others = others.filter(|(j, _)| *j != own && closes(*j));
     let standing: Vec<&Shown> = others
         .map(|(_, agent)| agent)
         .filter(|agent| stands(agent) && !far(agent))
@@ -96,9 +103,6 @@ pub fn closed_entry<'m>(
     };
     (!ways.is_empty() && ways.iter().all(is_closed)).then_some((lane, line))
 }
-
-/// Ways through junctions are not longer than this, metres.
-const LONGEST_M: f64 = 60.0;
 
 /// Collects the ways through the junction behind the last lane of `way`, with the lane behind it.
 fn walk<'m>(map: &'m MapGraph, way: &mut Vec<&'m Lane>, all: &mut Vec<Vec<&'m Lane>>) {

@@ -178,21 +178,23 @@ pub(super) struct Shut<'l> {
 }
 
 impl<'l> Shut<'l> {
-    /// For agents with these lights, which show these colours. `unheeded` is one for which nobody waits.
+    /// For agents with these lights, which show these colours. `unheeded` is one for which nobody waits;
+    /// `is_parked` says who closes no junction.
     pub(super) fn of(
         map: &MapGraph,
         agents: &[Shown],
-        unheeded: Option<usize>,
+        (unheeded, is_parked): (Option<usize>, impl Fn(usize) -> bool),
         lights: impl Iterator<Item = (&'l StopLine, LightState)>,
         colours: &Lights,
     ) -> Self {
         let is_lit = |lane| colours.colour(lane).is_some();
         let counts = |i: usize| unheeded != Some(i);
+        let closes = |i: usize| counts(i) && !is_parked(i);
         let entry = |i: usize| {
             let speed = agents[i].velocity().length();
             let stop = speed * speed / (2.0 * GENTLY) + speed * TOKEN_DT;
             let reach = stop + agents[i].body.length / 2.0 + LOOK_M;
-            let (lane, _) = closed_entry(map, agents, i, reach, is_lit, counts)?;
+            let (lane, _) = closed_entry(map, agents, i, reach, is_lit, closes)?;
             Some(StopLine::at_end(lane))
         };
         let ways = |i: usize| match agents[i].body.kind {
@@ -536,16 +538,23 @@ mod tests {
         let mut parts = scenario.map.parts().clone();
         parts.lanes[1].in_intersection = true;
         let map = MapGraph::new(parts).unwrap();
-        let moved = |across: Pose, drawn: f64| {
+        let moved_past = |across: Pose, is_parked: bool, drawn: f64| {
             let mut other = car(0.0, 0.0);
             other.pose = across;
             let agents = [car(-8.0, 3.0), other];
-            let shut = Shut::of(&map, &agents, None, std::iter::empty(), &Lights::default());
+            let shut = Shut::of(
+                &map,
+                &agents,
+                (None, |_| is_parked),
+                std::iter::empty(),
+                &Lights::default(),
+            );
             let mut moves = [straight(5.0), Pose::IDENTITY];
             let mut again = |who: &[usize], _: usize| vec![straight(drawn); who.len()];
             obey_lines(&agents, None, &shut, 3, &mut moves, &mut again);
             moves[0].position.x
         };
+        let moved = |across: Pose, drawn: f64| moved_past(across, false, drawn);
         let across = Pose::new(10.0, 1.0, std::f64::consts::FRAC_PI_2);
         // Its front is 6 m before the line. Drawn again it is slow enough; else it brakes with 2.8 m/s².
         assert_eq!(moved(across, 2.0), 2.0);
@@ -556,6 +565,8 @@ mod tests {
         );
         let beside = Pose::new(10.0, 9.0, std::f64::consts::FRAC_PI_2);
         assert_eq!(moved(beside, 2.0), 5.0);
+        // Nobody waits for one that is parked there.
+        assert_eq!(moved_past(across, true, 2.0), 5.0);
     }
 
     #[test]

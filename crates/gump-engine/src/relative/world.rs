@@ -656,7 +656,12 @@ impl Future {
                 .collect(),
         };
         let unheeded = driven.filter(|_| !sampling.yields_to_driven);
-        let shut = Shut::of(&self.scene.source, &agents, unheeded, lines, &colours);
+        let is_parked = |i: usize| {
+            let member = &self.members[i];
+            member.waited > PATIENCE_S[0] && !member.has_driven
+        };
+        let who = (unheeded, is_parked);
+        let shut = Shut::of(&self.scene.source, &agents, who, lines, &colours);
         obey_lines(&agents, driven, &shut, redraws, &mut moves, &mut again);
         // Redraws that keep agents clear of others must not make them cross such a line.
         let kept = moves.clone();

@@ -263,7 +263,8 @@ impl TrackDriver for NetworkDriver {
                 };
                 let is_lit = |lane| lights.colour(lane).is_some();
                 let keeps_clear = |i: usize| {
-                    let closed = closed_entry(streets, &agents, i, ENTRY_M, is_lit, |_| true);
+                    let closed =
+                        closed_entry(streets, &agents, i, ENTRY_M, is_lit, |j| !stays[here[j]]);
                     closed.map_or(f64::INFINITY, |(_, m)| before_line(&agents[i], m, 0.0))
                 };
                 let mut given = Vec::new();
