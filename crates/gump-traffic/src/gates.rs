@@ -2,8 +2,8 @@
 //! signals produce them, and leave where they drive out of it or where the map ends.
 //!
 //! There is one window around the start of the scene, and another around the ego once it has moved
-//! away from there. As soon as the start is outside of that, it is left behind. Where the ego leaves
-//! the map its window stays at the end.
+//! away from there. As soon as the start is outside of that, it is left behind. When the ego leaves the
+//! map there is the window around the start again.
 //!
 //! On average the number of agents per metre of lane stays as at the start. Agents do not appear or
 //! vanish in sight of the ego, except where their lane ends.
@@ -54,6 +54,9 @@ const MOVED_M: f64 = 20.0;
 /// An agent that is this far outside the window and moves away leaves, metres: not just where
 /// others enter.
 const BEYOND_M: f64 = 12.0;
+/// Where there are more lanes than this many times those of the start, the number of agents does not
+/// grow any more: a simulation must not slow down without bound where the ego comes to a large junction.
+const MOST_LANES: f64 = 2.0;
 /// The ego is off the map if no lane is this near, metres: wider than a road with its shoulder.
 const OFF_MAP_M: f64 = 15.0;
 /// Sampling distance along lanes, metres: shorter crossings of the border are missed.
@@ -114,8 +117,9 @@ pub(crate) struct Flow {
     gates: Vec<Gate>,
     /// Position of the ego when the gates were determined.
     looked_at: DVec2,
-    /// The start, until the ego has left it behind.
-    start: Option<DVec2>,
+    /// The start, and whether the ego has left it behind.
+    start: DVec2,
+    is_left: bool,
     /// The centres of the windows: the start, and the ego if it has moved on.
     centres: Vec<DVec2>,
     /// Metres of lanes in each window, and in that of the start at first.
@@ -155,7 +159,8 @@ impl Flow {
             time: 0.0,
             gates: gates(scene.map, &[ego], ego, config),
             looked_at: ego,
-            start: Some(ego),
+            start: ego,
+            is_left: false,
             centres: vec![ego],
             lanes_m: Vec::new(),
             lanes_at_start_m: 0.0,
@@ -231,14 +236,14 @@ impl Flow {
             return (Vec::new(), Vec::new());
         };
         let centre = driven.state.pose.position;
-        let is_on_map = || map.lanes_near(centre, OFF_MAP_M).next().is_some();
-        if centre.distance(self.looked_at) > MOVED_M && is_on_map() {
+        if centre.distance(self.looked_at) > MOVED_M {
             self.looked_at = centre;
-            let is_near = |start: &DVec2| start.distance(centre) <= self.config.window_m;
-            self.start = self.start.filter(is_near);
-            let is_here = |start: DVec2| start.distance(centre) <= MOVED_M;
-            let own = (!self.start.is_some_and(is_here)).then_some(centre);
-            self.centres = self.start.into_iter().chain(own).collect();
+            let is_on_map = map.lanes_near(centre, OFF_MAP_M).next().is_some();
+            let metres = self.start.distance(centre);
+            self.is_left = is_on_map && (self.is_left || metres > self.config.window_m);
+            let start = (!self.is_left).then_some(self.start);
+            let own = is_on_map && (self.is_left || metres > MOVED_M);
+            self.centres = start.into_iter().chain(own.then_some(centre)).collect();
             self.gates = gates(map, &self.centres, centre, &self.config);
             self.lanes_m = lane_metres(map, &self.centres, self.config.window_m);
         }
@@ -297,7 +302,8 @@ impl Flow {
         let k = gate.kind;
         let is_beside = |other: &&Gate| (other.kind, other.window) == (k, gate.window);
         let same = self.gates.iter().filter(is_beside).count() as f64;
-        let usual = self.usual[k] * self.lanes_m[gate.window] / self.lanes_at_start_m.max(1.0);
+        let lanes = self.lanes_m[gate.window] / self.lanes_at_start_m.max(1.0);
+        let usual = self.usual[k] * lanes.min(MOST_LANES);
         if usual == 0.0 {
             return None;
         }
@@ -635,7 +641,7 @@ mod tests {
     }
 
     #[test]
-    fn the_window_follows_the_ego_as_far_as_there_is_a_map() {
+    fn the_window_follows_the_ego_on_the_map() {
         // Two lanes from the start on, one beyond it.
         let text = "lane 1: -400,0 0,0 next 2\nlane 2: 0,0 400,0\nlane 3: -400,4 0,4\n\
                     ego vehicle 0: 0,0\nagent vehicle 1: -60,0 velocity 10,0";
@@ -665,9 +671,10 @@ mod tests {
         // The start is left behind, even if the ego returns.
         assert_eq!(at(200.0), (vec![200.0], vec![220.0]));
         assert_eq!(at(50.0).0, [50.0]);
-        // Off the map.
+        // Off the map, and on it again.
         assert_eq!(at(395.0).0, [395.0]);
-        assert_eq!(at(500.0), (vec![395.0], vec![120.0]));
+        assert_eq!(at(500.0), (vec![0.0], vec![330.0]));
+        assert_eq!(at(300.0).0, [300.0]);
     }
 
     #[test]

@@ -110,14 +110,13 @@ impl Camera {
     }
 
     /// This view from where the ego is after `step` steps, its heading up. Once it has left the map
-    /// nothing else is there to be seen, so the view stays at the last place on it; that of the start
-    /// if there is none.
+    /// nothing else is there to be seen, so the view is that of the start.
     pub(crate) fn with_ego(&self, rollout: &Rollout, step: usize) -> Self {
         let ego = |step| rollout.at(step).ego_now().state.pose;
-        let is_seen = |pose: &Pose| is_on_map(rollout.map(), pose.position);
-        let seen = (0..=step).rev().map(ego).find(is_seen);
+        let now = ego(step);
+        let is_seen = is_on_map(rollout.map(), now.position);
         Self {
-            world_from_camera: seen.unwrap_or_else(|| ego(0)),
+            world_from_camera: if is_seen { now } else { ego(0) },
             ..*self
         }
     }

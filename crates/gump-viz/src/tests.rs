@@ -336,7 +336,7 @@ fn a_film_frames_who_moves_and_follows_whom_it_cannot_frame() {
 }
 
 #[test]
-fn a_camera_stays_where_the_ego_leaves_the_map() {
+fn a_camera_goes_back_to_the_start_when_the_ego_leaves_the_map() {
     let scenario = fixture::scenario(
         "lane 1: -50,0 60,0\nego vehicle 0: 0,0 velocity 20,0\nhistory 1 future 8 dt 0.1",
     )
@@ -351,7 +351,7 @@ fn a_camera_stays_where_the_ego_leaves_the_map() {
     assert_eq!((at(0), at(10)), (0.0, 20.0));
     // It is farther than 25 m beyond the end of its lane after 4.25 s.
     assert!((at(42) - 84.0).abs() < 1e-9, "{}", at(42));
-    assert_eq!((at(43), at(80)), (at(42), at(42)));
+    assert_eq!((at(43), at(80)), (0.0, 0.0));
 }
 
 #[test]

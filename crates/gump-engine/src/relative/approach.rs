@@ -14,10 +14,10 @@ use gump_scene::{Lane, MapGraph};
 /// within this angle.
 const IN_LANE_M: f64 = 1.0;
 const IN_LANE: f64 = FRAC_PI_6;
-/// Hardly a driver brakes harder than this without need, m/s². One that would have to brake harder
-/// than the second for a line drives on.
+/// Hardly a driver brakes harder than this without need, m/s².
 pub const BRAKES_MPS2: f64 = 3.0;
-const HARDEST_MPS2: f64 = 6.0;
+/// One that would have to brake harder than this for a line drives on, m/s²: below the 8 of a dry road.
+pub const HARDEST_MPS2: f64 = 6.0;
 /// The distance that a vehicle's front may be over a line and it still waits, metres.
 pub const OVER_M: f64 = 0.5;
 

@@ -16,6 +16,7 @@ use gump_scene::{
 
 use crate::kinematic_limits::Limits;
 use crate::rejection::{BRAKING, Footprints, Member, POSES, Way, way};
+use crate::relative::approach::{HARDEST_MPS2, OVER_M};
 use crate::relative::keep_clear::closed_entry;
 use crate::relative::right_of_way::{Course, courses, yielding_speed};
 
@@ -24,9 +25,6 @@ use crate::relative::right_of_way::{Course, courses, yielding_speed};
 /// A slower vehicle is not braked, and one that braking makes slower stands, metres per second: a
 /// quarter of a metre in a step.
 const CREEPING: f64 = 0.5;
-/// Distance that a front bumper may be over a line before it counts as passed, metres: a vehicle
-/// that stopped a little late still waits.
-const OVER_M: f64 = 0.5;
 /// Lines of one junction lie within this, metres: those of neighbouring lanes may be staggered.
 const ONE_LINE_M: f64 = 4.0;
 /// A path that turns right by more than this is a right turn, radians (30 degrees).
@@ -34,10 +32,9 @@ const RIGHT: f64 = 0.52;
 /// A vehicle slower than this may turn right at red, metres per second: slowed to a fast walk. A
 /// full stop is not demanded.
 const TURNS_AT_RED: f64 = 2.0;
-/// Braking for a light begins where this deceleration is sufficient, metres per second squared, ...
+/// Braking for a light begins where this deceleration is sufficient, metres per second squared; it never
+/// exceeds [`HARDEST_MPS2`].
 const GENTLY: f64 = 4.0;
-/// ... and never exceeds this, below the 8 of a dry road: a vehicle that would need more drives on.
-const HARDEST: f64 = 6.0;
 
 /// Beyond the place where it could stop, a vehicle looks this far for a junction, metres.
 const LOOK_M: f64 = 2.0;
@@ -147,7 +144,7 @@ fn crossed<'l>(
 /// The same move with the braking needed to stop after this many metres.
 fn slowed(now: &Shown, step: Pose, room: f64) -> Pose {
     let (speed, length) = (now.velocity().length(), step.position.length());
-    let braking = (speed * speed / (2.0 * room.max(0.1))).min(HARDEST);
+    let braking = (speed * speed / (2.0 * room.max(0.1))).min(HARDEST_MPS2);
     let slower = (speed - braking * TOKEN_DT).max(0.0);
     if length < 1e-6 || slower < CREEPING {
         return Pose::IDENTITY;
@@ -167,7 +164,8 @@ fn runs_red(now: &Shown, step: Pose, lines: &[(&StopLine, LightState)]) -> bool 
     first.is_some_and(|first| first && shut.all(|shut| shut))
 }
 
-/// The lines that vehicles may not cross.
+/// What the rules of traffic forbid: lines that vehicles may not cross, and speeds at which they would
+/// not let others pass.
 pub(super) struct Shut<'l> {
     /// Those of lights, and what they show.
     lights: Vec<(&'l StopLine, LightState)>,
@@ -278,7 +276,7 @@ pub(super) fn obey_lines(
         let stands = speed < CREEPING;
         // An agent that can no longer stop before the line drives on.
         let room = shut.room(now, i, moves[i]);
-        if room.is_finite() && (stands || speed * speed / (2.0 * HARDEST) <= room) {
+        if room.is_finite() && (stands || speed * speed / (2.0 * HARDEST_MPS2) <= room) {
             moves[i] = slowed(now, moves[i], room);
         }
         let (most, length) = (shut.yielding(now, i) * TOKEN_DT, moves[i].position.length());
@@ -567,6 +565,24 @@ mod tests {
         assert_eq!(moved(beside, 2.0), 5.0);
         // Nobody waits for one that is parked there.
         assert_eq!(moved_past(across, true, 2.0), 5.0);
+    }
+
+    #[test]
+    fn who_has_to_give_way_is_slow_enough_or_brakes() {
+        let settled = |most: f64, drawn: f64| {
+            let shut = Shut {
+                most: vec![most],
+                ..lit(&[])
+            };
+            let mut moves = [straight(3.0)];
+            let mut again = |who: &[usize], _: usize| vec![straight(drawn); who.len()];
+            obey_lines(&[car(0.0, 3.0)], None, &shut, 3, &mut moves, &mut again);
+            moves[0].position.x
+        };
+        assert_eq!(settled(f64::INFINITY, 1.0), 3.0);
+        // At 6 m/s; it loses 2 in the step at most, and is held to 5.
+        assert_eq!((settled(5.0, 2.4), settled(5.0, 3.0)), (2.4, 2.5));
+        assert_eq!((settled(0.0, 1.9), settled(0.0, 3.0)), (1.9, 2.0));
     }
 
     #[test]

@@ -59,8 +59,8 @@ const GAP_S: f64 = 4.0;
 const NEAR_PATH_M: f64 = 1.5;
 /// ... and moves faster than this, metres per second.
 const MOVES: f64 = 0.5;
-/// In a junction patience is at most this, seconds, as long as a benchmark of 8 s does not show: who
-/// stands there stands in the way. Vehicles that hold each other there squeeze past at once.
+/// In a junction patience is at most this, seconds, longer than a benchmark of 8 s shows: who stands
+/// there stands in the way. Vehicles that hold each other there squeeze past at once.
 const INSIDE_S: f64 = 9.0;
 /// Agents that wait for each other are within this, metres, and meet at more than this angle,
 /// radians.
@@ -93,9 +93,9 @@ struct Room {
 ///
 /// A vehicle or bicycle in a lane could if no agent is on the path ahead or about to cross it, no
 /// light forbids it, and of those whose paths meet there it has waited longest. After twice the time,
-/// in a junction at once, less room suffices between vehicles that stand across each other's paths. A pedestrian could if
-/// it stands on the path of a vehicle or bicycle that has waited as long. `agents` are all of the
-/// frame.
+/// in a junction at once, less room suffices between vehicles that stand across each other's paths.
+/// A pedestrian could if it stands on the path of a vehicle or bicycle that has waited as long.
+/// `agents` are all of the frame.
 pub(super) fn free_to_go(map: &MapGraph, lights: &[Light], agents: &[Standing]) -> Vec<usize> {
     let is_patient = |one: &Standing| one.patience_s.is_infinite() || one.waited_s <= INSIDE_S;
     let inside = |one: &Standing| !is_patient(one) && is_inside(map, &one.agent);
@@ -381,5 +381,33 @@ mod tests {
         assert_eq!(free(&crossing, &[(0, 9.0), (1, 9.0)]), [0]);
         // One that has just come may move on by itself.
         assert!(free(&crossing, &[(0, 1.0), (1, 9.0)]).is_empty());
+    }
+
+    #[test]
+    fn in_a_junction_patience_ends_after_nine_seconds() {
+        let scenario = scenario(
+            "lane 1: 0,0 60,0\nlane 2: 30,-40 30,40\n\
+             ego vehicle 0: 26.4,0\nagent vehicle 1: 30,-3.6 heading 1.5708",
+        );
+        let scene = scenario.present();
+        let go = |inside: bool, waited_s: f64, patience_s: f64| {
+            let mut parts = scenario.map.parts().clone();
+            for lane in &mut parts.lanes {
+                lane.in_intersection = inside;
+            }
+            let standing = |agent: &Agent| Standing {
+                agent: *agent,
+                waited_s,
+                patience_s,
+                has_driven: true,
+            };
+            let agents: Vec<_> = scene.now().agents().iter().map(standing).collect();
+            free_to_go(&MapGraph::new(parts).unwrap(), &[], &agents)
+        };
+        // They hold each other, 0.2 m beside their paths.
+        assert_eq!(go(true, 9.5, 20.0), [0]);
+        assert!(go(false, 9.5, 20.0).is_empty() && go(true, 8.5, 20.0).is_empty());
+        // One that is driven from outside is not released.
+        assert!(go(true, 9.5, f64::INFINITY).is_empty());
     }
 }
