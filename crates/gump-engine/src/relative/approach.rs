@@ -6,6 +6,7 @@ use std::f64::consts::FRAC_PI_6;
 
 use gump_geometry::{Pose, angle_difference};
 use gump_model::relative::graph::Shown;
+use gump_model::steps::TOKEN_DT;
 use gump_scene::{Lane, MapGraph};
 
 // All were chosen by hand.
@@ -30,6 +31,16 @@ pub fn before_line(now: &Shown, metres: f64, least: f64) -> f64 {
         return f64::INFINITY;
     }
     (least * least + 2.0 * BRAKES_MPS2 * room.max(0.0)).sqrt()
+}
+
+/// The greatest speed of the next step after which a vehicle can still stop before a line, metres per
+/// second; infinite as in [`before_line`].
+pub fn stopping_before(now: &Shown, metres: f64) -> f64 {
+    if before_line(now, metres, 0.0).is_infinite() {
+        return f64::INFINITY;
+    }
+    let room = (metres - now.body.length / 2.0).max(0.0);
+    BRAKES_MPS2 * ((TOKEN_DT * TOKEN_DT + 2.0 * room / BRAKES_MPS2).sqrt() - TOKEN_DT)
 }
 
 /// Whether a stop sign applies to a lane: at its start if it is in a junction, at its end otherwise.

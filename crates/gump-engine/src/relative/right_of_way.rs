@@ -5,11 +5,11 @@
 //! middle. Here vehicles are looked at along their lanes, for as long as it takes to stop gently, and
 //! the one that has to give way gets a greatest speed.
 
-use gump_geometry::{DVec2, angle_difference};
+use gump_geometry::{DVec2, OrientedBox, angle_difference};
 use gump_model::relative::graph::{Lights, Shown};
 use gump_scene::{Lane, LightState, MapGraph};
 
-use crate::relative::approach::{OVER_M, before_line, has_sign, lane_under};
+use crate::relative::approach::{OVER_M, before_line, has_sign, lane_under, stopping_before};
 
 // All were chosen by hand.
 
@@ -20,6 +20,8 @@ const COURSES: usize = 6;
 const LANES: usize = 8;
 /// Two courses meet where they are nearer than half of both widths and this, metres, ...
 const BESIDE_M: f64 = 0.4;
+/// or, for those that are so from the start, so much nearer, metres, ...
+const CLOSER_M: [f64; 3] = [0.0, 0.4, 0.8];
 /// ... for this far at most, metres: lanes that merge stay together.
 const TOGETHER_M: f64 = 6.0;
 /// Who comes to the place of meeting later than this does not count, seconds; nor do two that are there
@@ -28,10 +30,15 @@ const SOON_S: f64 = 5.0;
 const APART_S: f64 = 0.8;
 /// A vehicle slower than this is not about to come, metres per second.
 const MOVES_MPS: f64 = 1.0;
-/// One that gives way starts with this acceleration otherwise, m/s², and stops this far before the
-/// place, metres.
-const STARTS_MPS2: f64 = 1.2;
+/// A slower one than this starts, metres per second, with accelerations between these, m/s².
+const SLOW_MPS: f64 = 6.0;
+const STARTS_MPS2: (f64, f64) = (1.0, 1.5);
+/// One that gives way stops this far before the place, metres.
 const BEFORE_M: f64 = 1.0;
+/// Who stands across the way of another stands at more than this angle to it, radians, with a corner
+/// nearer to the path of its side than this, metres.
+const ACROSS: f64 = 0.5;
+const SIDE_M: f64 = 0.3;
 /// A course turns if its direction changes by more than this, radians, and is opposite to another if they
 /// differ from half a turn by less than this, radians.
 const TURNS: f64 = 0.5;
@@ -43,7 +50,8 @@ pub struct Course {
     points: Vec<DVec2>,
     /// The least and the greatest coordinates of these.
     bounds: (DVec2, DVec2),
-    /// Direction at the start, radians, and by how much it turns, to the left above 0.
+    /// Direction at the start, in a junction that of its lane, radians, and by how much it turns, to the
+    /// left above 0.
     heading: f64,
     turn: f64,
     /// Metres to the first junction that it drives into; `None` if there is none.
@@ -96,7 +104,12 @@ fn walk<'a>(
 fn course(streets: &MapGraph, lights: &Lights, now: &Shown, way: &[&Lane], at: f64) -> Course {
     let (mut points, mut base, mut line) = (Vec::new(), -at, None);
     let mut end = way[0].centerline.pose_at(at).heading;
-    let heading = end;
+    let is_inside = way[0].in_intersection;
+    // Who turns left does so to the end of the turn.
+    let heading = match is_inside {
+        true => way[0].centerline.pose_at(0.0).heading,
+        false => end,
+    };
     for (i, lane) in way.iter().enumerate() {
         let length = lane.centerline.length();
         if i > 0 && line.is_none() && lane.in_intersection && !way[i - 1].in_intersection {
@@ -109,7 +122,6 @@ fn course(streets: &MapGraph, lights: &Lights, now: &Shown, way: &[&Lane], at: f
         }
         base += length;
     }
-    let is_inside = way[0].in_intersection;
     let least = points.iter().copied().fold(DVec2::INFINITY, DVec2::min);
     let greatest = points.iter().copied().fold(DVec2::NEG_INFINITY, DVec2::max);
     Course {
@@ -139,7 +151,21 @@ pub fn yielding_speed<'a>(
             .filter_map(|other| course.limit(other.first()?));
         limits.fold(f64::INFINITY, f64::min)
     };
-    own.iter().map(of).reduce(f64::max).unwrap_or(f64::INFINITY)
+    let best = own.iter().map(of).reduce(f64::max).unwrap_or(f64::INFINITY);
+    let leaves_room = |own: &Course| {
+        let limits = others
+            .clone()
+            .filter_map(|other| own.leaves_room(other.first()?));
+        limits.fold(f64::INFINITY, f64::min)
+    };
+    best.min(own.first().map_or(f64::INFINITY, leaves_room))
+}
+
+/// Whether one turns left before another that comes from the opposite direction and does not.
+fn turns_left_before(one: &Course, other: &Course) -> bool {
+    let opposite =
+        angle_difference(one.heading, other.heading).abs() > std::f64::consts::PI - OPPOSITE;
+    opposite && one.turn > TURNS && other.turn < TURNS
 }
 
 /// Where two courses meet, metres from the centres.
@@ -155,8 +181,8 @@ impl Course {
 
     /// The greatest speed if this one has to let another pass.
     fn limit(&self, other: &Self) -> Option<f64> {
-        let stays_out = other.is_red && !other.is_inside;
-        if (self.line_m.is_none() && !self.is_inside) || stays_out || other.speed() < MOVES_MPS {
+        let stays_out = !other.is_inside && (other.is_red || (self.is_signed && other.stops()));
+        if (self.line_m.is_none() && !self.is_inside) || stays_out {
             return None;
         }
         let half = 0.5 * (self.now.body.length + other.now.body.length);
@@ -165,11 +191,19 @@ impl Course {
             return None;
         }
         let meeting = self.meets(other)?;
+        let can_stop =
+            |course: &Self, place: f64| before_line(&course.now, place - BEFORE_M, 0.0).is_finite();
+        let is_bound = !can_stop(other, meeting.other.0) && can_stop(self, meeting.own.0);
+        if !self.expects(other, is_bound) {
+            return None;
+        }
         let mine = self.times(meeting.own, half);
         let its = other.times(meeting.other, half);
         let is_soon = mine.0 < SOON_S && its.0 < SOON_S;
-        let is_apart = mine.0 > its.1 + APART_S || its.0 > mine.1 + APART_S;
-        if !is_soon || is_apart || !self.gives_way(other, mine.0 > its.0) {
+        // It cannot be told when one that stands has gone.
+        let has_gone = other.speed() >= MOVES_MPS && mine.0 > its.1 + APART_S;
+        let is_apart = has_gone || its.0 > mine.1 + APART_S;
+        if !is_soon || is_apart || !(is_bound || self.gives_way(other, mine.0 > its.0)) {
             return None;
         }
         let place = meeting.own.0 - BEFORE_M;
@@ -177,20 +211,58 @@ impl Course {
         let line = self
             .line_m
             .filter(|line| line - self.now.body.length / 2.0 > -OVER_M);
-        Some(before_line(
-            &self.now,
-            line.map_or(place, |line| line.min(place)),
-            0.0,
-        ))
+        let place = line.map_or(place, |line| line.min(place));
+        Some(stopping_before(&self.now, place))
+    }
+
+    /// Whether it has yet to stop at a sign.
+    fn stops(&self) -> bool {
+        let front = self.now.body.length / 2.0;
+        self.is_signed && self.line_m.is_some_and(|line| line - front > OVER_M)
+    }
+
+    /// Whether another is about to come: it moves, or it waits in the junction, and not to let this one
+    /// pass. `is_bound` says that it is too late for that.
+    fn expects(&self, other: &Self, is_bound: bool) -> bool {
+        let waits_for_it = turns_left_before(other, self) && !is_bound;
+        other.speed() >= MOVES_MPS || (other.is_inside && !waits_for_it)
+    }
+
+    /// The greatest speed before another that stands in a junction across its way: it stops where the
+    /// other can still drive on, and not at its bumper.
+    fn leaves_room(&self, other: &Self) -> Option<f64> {
+        let turned = angle_difference(self.now.pose.heading, other.now.pose.heading).abs();
+        let apart = self.now.pose.position.distance(other.now.pose.position);
+        if other.speed() >= MOVES_MPS
+            || !other.is_inside
+            || turned < ACROSS
+            || apart > REACH_M as f64 + other.now.body.length
+        {
+            return None;
+        }
+        let corners = OrientedBox {
+            pose: other.now.pose,
+            length: other.now.body.length,
+            width: other.now.body.width,
+        }
+        .corners();
+        let near = 0.5 * self.now.body.width + SIDE_M;
+        let blocks = |corner: &DVec2| {
+            let squared = |point: &DVec2| point.distance_squared(*corner);
+            self.points.iter().any(|point| squared(point) < near * near)
+        };
+        if !corners.iter().any(blocks) {
+            return None;
+        }
+        let place = self.meets(other)?.own.0 - BEFORE_M;
+        Some(stopping_before(&self.now, place))
     }
 
     /// Whether it has to let another pass that it meets; `is_later` says who comes there first.
     fn gives_way(&self, other: &Self, is_later: bool) -> bool {
-        let opposite =
-            angle_difference(self.heading, other.heading).abs() > std::f64::consts::PI - OPPOSITE;
-        let crosses = |one: &Self, to: &Self| opposite && one.turn > TURNS && to.turn < TURNS;
-        if crosses(self, other) != crosses(other, self) {
-            return crosses(self, other);
+        let turns_left = turns_left_before(self, other);
+        if turns_left != turns_left_before(other, self) {
+            return turns_left;
         }
         if self.is_inside != other.is_inside {
             return other.is_inside;
@@ -201,22 +273,26 @@ impl Course {
         is_later
     }
 
-    /// Seconds until it comes to a stretch of its course and has left it.
+    /// Seconds until it comes to a stretch of its course, at the earliest, and has left it, at the latest.
     fn times(&self, (from, to): (f64, f64), half: f64) -> (f64, f64) {
         let speed = self.speed();
-        let until = |metres: f64| match metres > 0.0 {
-            // Vehicles that wait start.
-            true if speed < MOVES_MPS => (2.0 * metres / STARTS_MPS2).sqrt(),
+        let until = |metres: f64, starts: f64| match metres > 0.0 {
+            true if speed < SLOW_MPS => {
+                ((speed * speed + 2.0 * starts * metres).sqrt() - speed) / starts
+            }
             true => metres / speed,
             false => 0.0,
         };
-        (until(from - half), until(to + half))
+        (
+            until(from - half, STARTS_MPS2.1),
+            until(to + half, STARTS_MPS2.0),
+        )
     }
 
     /// A place farther ahead than this is not reached soon, metres.
     fn reach(&self, half: f64) -> f64 {
         let driven = match self.speed() {
-            speed if speed < MOVES_MPS => 0.5 * STARTS_MPS2 * SOON_S * SOON_S,
+            speed if speed < SLOW_MPS => speed * SOON_S + 0.5 * STARTS_MPS2.1 * SOON_S * SOON_S,
             speed => speed * SOON_S,
         };
         driven + half
@@ -234,6 +310,14 @@ impl Course {
         if lies_beyond(self, other) || lies_beyond(other, self) {
             return None;
         }
+        // One that turns left may have driven beside the oncoming lane before.
+        CLOSER_M
+            .iter()
+            .find_map(|closer| self.meets_within(other, near - closer))
+    }
+
+    /// As [`Self::meets`], where courses are beside each other if they are nearer than this, metres.
+    fn meets_within(&self, other: &Self, near: f64) -> Option<Meeting> {
         let hits = |point: &DVec2| {
             let distance = |(j, of): (usize, &DVec2)| (of.distance_squared(*point), j);
             let nearest = other.points.iter().enumerate().map(distance);
@@ -243,6 +327,8 @@ impl Course {
         let mut found: Option<Meeting> = None;
         for (i, point) in self.points.iter().enumerate() {
             match (hits(point), &mut found) {
+                // One behind the other, or already beside each other.
+                (Some(at), None) if i == 0 || at == 0.0 => return None,
                 (Some(at), None) => {
                     found = Some(Meeting {
                         own: (i as f64, i as f64),
@@ -257,8 +343,7 @@ impl Course {
                 (None, Some(_)) => break,
             }
         }
-        // Not one behind the other, nor already beside each other.
-        let mut meeting = found.filter(|at| at.own.0 > 0.0 && at.other.0 > 0.0)?;
+        let mut meeting = found.filter(|at| at.other.0 > 0.0)?;
         for stretch in [&mut meeting.own, &mut meeting.other] {
             stretch.1 = stretch.1.min(stretch.0 + TOGETHER_M);
         }
@@ -332,7 +417,8 @@ mod tests {
         };
         // 32 m at 8 m/s and 30 m at 10: the line is 20 m ahead.
         let (own, other) = meet(20.0, 8.0, 10.0);
-        assert!((own - (6.0_f64 * 17.75).sqrt()).abs() < 0.5, "{own}");
+        // It stops at 3 m/s² in the 17.75 m that its front has, after half a second at this speed.
+        assert!((17.75 - own / 2.0 - own * own / 6.0).abs() < 0.1, "{own}");
         assert!(other.is_infinite());
         // The other one later; with seconds between them; and who stands does not come.
         assert!(meet(25.0, 10.0, 7.0).0.is_infinite() && meet(25.0, 10.0, 7.0).1.is_finite());
@@ -376,6 +462,63 @@ mod tests {
         let undecided = car((36.0, 0.0), WEST, 5.0);
         let (own, other) = speeds(&map, &none, undecided, car((75.0, 5.0), EAST, 9.0));
         assert!(own.is_infinite() && other.is_infinite());
+    }
+
+    #[test]
+    fn who_stands_in_the_junction_is_expected_to_go_on() {
+        let map = crossing(&[]);
+        let none = Lights::default();
+        // Both stand inside, 8 and 3 m before the lanes cross.
+        let (own, other) = speeds(
+            &map,
+            &none,
+            car((44.0, 0.0), WEST, 0.0),
+            car((52.0, -3.0), SOUTH, 0.0),
+        );
+        assert!(own.is_finite() && other.is_infinite(), "{own} {other}");
+        // Who waits to turn left lets the other one pass, ...
+        let straight = car((66.0, 5.0), EAST, 5.0);
+        let (own, other) = speeds(&map, &none, car((44.0, 0.7), 0.17, 0.0), straight);
+        assert!(own.is_finite() && other.is_infinite(), "{own} {other}");
+        // ... unless it stands in its way already: then that one stops where the turn goes on.
+        let (own, other) = speeds(&map, &none, car((49.0, 2.9), 0.8, 0.0), straight);
+        assert!(own.is_infinite() && other < 5.0, "{own} {other}");
+        let at_the_line = car((61.0, 5.0), EAST, 0.0);
+        let (_, other) = speeds(&map, &none, car((49.0, 2.9), 0.8, 0.0), at_the_line);
+        // It may start, but not up to the bumper.
+        assert!(other < 5.0, "{other}");
+    }
+
+    #[test]
+    fn who_has_to_stop_at_a_sign_first_is_not_waited_for() {
+        let map = crossing(&[1, 4]);
+        let speed = |other: f64| {
+            let own = car((37.7, 0.0), WEST, 0.0);
+            let other = car((52.0, other), SOUTH, 6.0);
+            speeds(&map, &Lights::default(), own, other).0
+        };
+        // 5 m before its line, and over it.
+        assert!(speed(-17.25).is_infinite() && speed(-11.0).is_finite());
+    }
+
+    #[test]
+    fn who_has_turned_beside_the_oncoming_lane_is_let_pass() {
+        // Its centre is nearer to that lane than two vehicles' that keep their distance.
+        let scenario = fixture::scenario(
+            "lane 1: 0,0 40,0 next 2\nlane 2: 40,0 46,0.6 52,3 56,8\n\
+             lane 7: 120,2.2 66,2.2 next 8\nlane 8: 66,2.2 30,2.2 next 9\nlane 9: 30,2.2 0,2.2\n\
+             ego vehicle 0: 5,0",
+        )
+        .unwrap();
+        let mut parts = scenario.map.parts().clone();
+        for lane in &mut parts.lanes {
+            lane.in_intersection = [2, 8].contains(&lane.id.0);
+        }
+        let map = MapGraph::new(parts).unwrap();
+        let turning = car((44.5, 0.4), 0.1, 3.0);
+        let none = Lights::default();
+        let (own, other) = speeds(&map, &none, turning, car((70.0, 2.2), EAST, 9.0));
+        assert!(own.is_infinite() && other.is_finite(), "{own} {other}");
     }
 
     #[test]

@@ -203,7 +203,8 @@ impl<'l> Shut<'l> {
         };
         let ways: Vec<Vec<Course>> = (0..agents.len()).map(ways).collect();
         let most = |i: usize| {
-            let others = ways.iter().enumerate().filter(|(j, _)| *j != i);
+            let others = ways.iter().enumerate();
+            let others = others.filter(|(j, _)| *j != i && !is_parked(*j));
             yielding_speed(&ways[i], &others.map(|(_, way)| &way[..]))
         };
         Self {

@@ -258,7 +258,8 @@ impl TrackDriver for NetworkDriver {
                 };
                 let ways: Vec<Vec<Course>> = agents.iter().map(ways).collect();
                 let yields = |i: usize| {
-                    let others = ways.iter().enumerate().filter(|(j, _)| *j != i);
+                    let others = ways.iter().enumerate();
+                    let others = others.filter(|(j, _)| *j != i && !stays[here[*j]]);
                     yielding_speed(&ways[i], &others.map(|(_, way)| &way[..]))
                 };
                 let is_lit = |lane| lights.colour(lane).is_some();
