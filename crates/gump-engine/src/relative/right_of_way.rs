@@ -517,7 +517,7 @@ mod tests {
         let map = MapGraph::new(parts).unwrap();
         let turning = car((44.5, 0.4), 0.1, 3.0);
         let none = Lights::default();
-        let (own, other) = speeds(&map, &none, turning, car((70.0, 2.2), EAST, 9.0));
+        let (own, other) = speeds(&map, &none, turning, car((64.0, 2.2), EAST, 8.0));
         assert!(own.is_infinite() && other.is_finite(), "{own} {other}");
     }
 
