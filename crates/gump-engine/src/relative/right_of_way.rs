@@ -139,26 +139,22 @@ fn course(streets: &MapGraph, lights: &Lights, now: &Shown, way: &[&Lane], at: f
 }
 
 /// The greatest speed of a vehicle for those that it has to let pass, metres per second: on the best of
-/// its courses. Infinite if nobody comes. `others` are the courses of each other vehicle, the likeliest
-/// first.
+/// its courses, and on the straightest one before those that stand across it. Infinite if there is
+/// nobody. `others` are the courses of each other vehicle, the likeliest first.
 pub fn yielding_speed<'a>(
     own: &[Course],
     others: &(impl Iterator<Item = &'a [Course]> + Clone),
 ) -> f64 {
-    let of = |course: &Course| {
-        let limits = others
-            .clone()
-            .filter_map(|other| course.limit(other.first()?));
+    let least = |limit: &dyn Fn(&Course) -> Option<f64>| {
+        let limits = others.clone().filter_map(|other| limit(other.first()?));
         limits.fold(f64::INFINITY, f64::min)
     };
-    let best = own.iter().map(of).reduce(f64::max).unwrap_or(f64::INFINITY);
-    let leaves_room = |own: &Course| {
-        let limits = others
-            .clone()
-            .filter_map(|other| own.leaves_room(other.first()?));
-        limits.fold(f64::INFINITY, f64::min)
-    };
-    best.min(own.first().map_or(f64::INFINITY, leaves_room))
+    let lets_pass = own.iter().map(|own| least(&|other| own.limit(other)));
+    let leaves_room = own
+        .first()
+        .map(|own| least(&|other| own.leaves_room(other)));
+    let best = lets_pass.reduce(f64::max).unwrap_or(f64::INFINITY);
+    best.min(leaves_room.unwrap_or(f64::INFINITY))
 }
 
 /// Whether one turns left before another that comes from the opposite direction and does not.
