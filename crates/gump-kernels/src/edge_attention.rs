@@ -174,14 +174,21 @@ fn weigh<'a>(
     let Heads { n, d, f } = heads;
     let (q, u) = query.split_at(n * d);
     let scale = heads.scale();
-    dots(n, n_edges, scores, |h, e, lanes| {
-        let (key, feature) = (&source(e)[..n * d], &feature(e)[..f]);
-        add_products(lanes, &q[h * d..(h + 1) * d], &key[h * d..(h + 1) * d]);
-        for lane in lanes.iter_mut() {
-            *lane *= scale;
-        }
-        add_products(lanes, &u[h * f..(h + 1) * f], feature);
-    });
+    dots(
+        n,
+        n_edges,
+        scores,
+        // Out of line it would not have the instructions of the function around it.
+        #[inline(always)]
+        |h, e, lanes| {
+            let (key, feature) = (&source(e)[..n * d], &feature(e)[..f]);
+            add_products(lanes, &q[h * d..(h + 1) * d], &key[h * d..(h + 1) * d]);
+            for lane in lanes.iter_mut() {
+                *lane *= scale;
+            }
+            add_products(lanes, &u[h * f..(h + 1) * f], feature);
+        },
+    );
     for scores in scores.chunks_exact_mut(n_edges.max(1)) {
         let sum = exp_shifted_sum(scores, max(scores));
         let by = 1.0 / sum;
@@ -406,12 +413,18 @@ fn slopes_of<'a>(
 ) {
     let Heads { n, d, f } = heads;
     let (d_values, d_averages) = d_out.split_at(n * d);
-    dots(n, n_edges, slopes, |h, e, lanes| {
-        let (value, feature) = (&source(e)[n * d..2 * n * d], &feature(e)[..f]);
-        let of_head = h * d..(h + 1) * d;
-        add_products(lanes, &d_values[of_head.clone()], &value[of_head]);
-        add_products(lanes, &d_averages[h * f..(h + 1) * f], feature);
-    });
+    dots(
+        n,
+        n_edges,
+        slopes,
+        #[inline(always)]
+        |h, e, lanes| {
+            let (value, feature) = (&source(e)[n * d..2 * n * d], &feature(e)[..f]);
+            let of_head = h * d..(h + 1) * d;
+            add_products(lanes, &d_values[of_head.clone()], &value[of_head]);
+            add_products(lanes, &d_averages[h * f..(h + 1) * f], feature);
+        },
+    );
     let rows = slopes.chunks_exact_mut(n_edges.max(1));
     for (slopes, weights) in rows.zip(weights.chunks_exact(n_edges.max(1))) {
         let mean: f32 = slopes.iter().zip(weights).map(|(s, p)| s * p).sum();
