@@ -43,8 +43,8 @@ pub fn ways_cross(one: &Polyline, other: &Polyline) -> bool {
     }
     one.segments().any(|(a, b)| {
         other.segments().any(|(c, d)| {
-            let angle = angle_difference((b - a).to_angle(), (d - c).to_angle()).abs();
-            angle > FRAC_PI_6 && segments_intersect(a, b, c, d)
+            let angle = || angle_difference((b - a).to_angle(), (d - c).to_angle()).abs();
+            segments_intersect(a, b, c, d) && angle() > FRAC_PI_6
         })
     })
 }

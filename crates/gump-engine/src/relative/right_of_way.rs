@@ -103,12 +103,12 @@ fn walk<'a>(
 
 fn course(streets: &MapGraph, lights: &Lights, now: &Shown, way: &[&Lane], at: f64) -> Course {
     let (mut points, mut base, mut line) = (Vec::new(), -at, None);
-    let mut end = way[0].centerline.pose_at(at).heading;
+    let mut last = (way[0], at);
     let is_inside = way[0].in_intersection;
     // Who turns left does so to the end of the turn.
     let heading = match is_inside {
         true => way[0].centerline.pose_at(0.0).heading,
-        false => end,
+        false => way[0].centerline.pose_at(at).heading,
     };
     for (i, lane) in way.iter().enumerate() {
         let length = lane.centerline.length();
@@ -116,12 +116,12 @@ fn course(streets: &MapGraph, lights: &Lights, now: &Shown, way: &[&Lane], at: f
             line = Some((base, way[i - 1], *lane));
         }
         while points.len() <= REACH_M && points.len() as f64 <= base + length {
-            let pose = lane.centerline.pose_at(points.len() as f64 - base);
-            points.push(pose.position);
-            end = pose.heading;
+            points.push(lane.centerline.point_at(points.len() as f64 - base));
+            last = (*lane, points.len() as f64 - 1.0 - base);
         }
         base += length;
     }
+    let end = last.0.centerline.pose_at(last.1).heading;
     let least = points.iter().copied().fold(DVec2::INFINITY, DVec2::min);
     let greatest = points.iter().copied().fold(DVec2::NEG_INFINITY, DVec2::max);
     Course {
@@ -203,12 +203,15 @@ impl Course {
             return None;
         }
         let place = meeting.own.0 - BEFORE_M;
-        // It waits at the line, if it is not over it.
+        // It waits at the line, if it is not over it and can still stop there.
+        let front = self.now.body.length / 2.0;
         let line = self
             .line_m
-            .filter(|line| line - self.now.body.length / 2.0 > -OVER_M);
-        let place = line.map_or(place, |line| line.min(place));
-        Some(stopping_before(&self.now, place))
+            .filter(|line| *line < place && line - front > -OVER_M);
+        let at_line = line
+            .map(|line| stopping_before(&self.now, line))
+            .filter(|speed| speed.is_finite());
+        Some(at_line.unwrap_or_else(|| stopping_before(&self.now, place)))
     }
 
     /// Whether it has yet to stop at a sign.
@@ -314,7 +317,12 @@ impl Course {
 
     /// As [`Self::meets`], where courses are beside each other if they are nearer than this, metres.
     fn meets_within(&self, other: &Self, near: f64) -> Option<Meeting> {
+        let (least, greatest) = (other.bounds.0 - near, other.bounds.1 + near);
         let hits = |point: &DVec2| {
+            let is_outside = (least - *point).max(*point - greatest).max_element() > 0.0;
+            if is_outside {
+                return None;
+            }
             let distance = |(j, of): (usize, &DVec2)| (of.distance_squared(*point), j);
             let nearest = other.points.iter().enumerate().map(distance);
             let nearest = nearest.min_by(|a, b| a.0.total_cmp(&b.0))?;

@@ -361,6 +361,7 @@ fn neighbours(map: &VectorMap, agents: &[Shown], i: usize, paths: &Paths, view: 
         .collect();
     near.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
     near.truncate(NEIGHBOURS);
+    view.neighbours.reserve(near.len());
     for (_, j) in near {
         let other = &agents[j];
         let mut row = relative(1, from, Axes::of(other.pose));
@@ -446,6 +447,7 @@ fn pieces(map: &VectorMap, lights: &Lights, own: &Shown, paths: &Paths, view: &m
             }
         }
     }
+    view.pieces.reserve(ahead.len() + LANES + EDGES + AREAS);
     for &(i, away, on) in &ahead {
         let mut row = map_edge(map, lights, axes, i);
         for (k, on) in on.into_iter().enumerate() {
