@@ -21,6 +21,9 @@ pub const BRAKES_MPS2: f64 = 3.0;
 pub const HARDEST_MPS2: f64 = 6.0;
 /// The distance that a vehicle's front may be over a line and it still waits, metres.
 pub const OVER_M: f64 = 0.5;
+/// Drivers roll past stop signs at this speed at most, metres per second: hardly a recorded one is faster
+/// at the line.
+pub const ROLLS_MPS: f64 = 2.5;
 
 /// The greatest speed of a vehicle before a line that it crosses at `least` metres per second at most;
 /// infinite if it is over the line, or too fast to get there.
@@ -33,14 +36,16 @@ pub fn before_line(now: &Shown, metres: f64, least: f64) -> f64 {
     (least * least + 2.0 * BRAKES_MPS2 * room.max(0.0)).sqrt()
 }
 
-/// The greatest speed of the next step after which a vehicle can still stop before a line, metres per
-/// second; infinite as in [`before_line`].
-pub fn stopping_before(now: &Shown, metres: f64) -> f64 {
-    if before_line(now, metres, 0.0).is_infinite() {
+/// The greatest speed of the next step after which a vehicle can still cross a line at `least` metres per
+/// second, or stop before it at 0; infinite as in [`before_line`].
+pub fn slowing_before(now: &Shown, metres: f64, least: f64) -> f64 {
+    if before_line(now, metres, least).is_infinite() {
         return f64::INFINITY;
     }
     let room = (metres - now.body.length / 2.0).max(0.0);
-    BRAKES_MPS2 * ((TOKEN_DT * TOKEN_DT + 2.0 * room / BRAKES_MPS2).sqrt() - TOKEN_DT)
+    let squared = (2.0 * room + least * least / BRAKES_MPS2) / BRAKES_MPS2;
+    let speed = BRAKES_MPS2 * ((TOKEN_DT * TOKEN_DT + squared).sqrt() - TOKEN_DT);
+    speed.max(least)
 }
 
 /// Whether a stop sign applies to a lane: at its start if it is in a junction, at its end otherwise.

@@ -9,7 +9,9 @@ use gump_geometry::{DVec2, OrientedBox, angle_difference};
 use gump_model::relative::graph::{Lights, Shown};
 use gump_scene::{Lane, LightState, MapGraph};
 
-use crate::relative::approach::{OVER_M, before_line, has_sign, lane_under, stopping_before};
+use crate::relative::approach::{
+    OVER_M, ROLLS_MPS, before_line, has_sign, lane_under, slowing_before,
+};
 
 // All were chosen by hand.
 
@@ -157,6 +159,18 @@ pub fn yielding_speed<'a>(
     best.min(leaves_room.unwrap_or(f64::INFINITY))
 }
 
+/// The greatest speed of a vehicle for stop signs, metres per second, on the best of its courses.
+pub fn speed_for_signs(own: &[Course]) -> f64 {
+    let before = |own: &Course| match own.line_m {
+        Some(line) if own.is_signed => slowing_before(&own.now, line, ROLLS_MPS),
+        _ => f64::INFINITY,
+    };
+    own.iter()
+        .map(before)
+        .reduce(f64::max)
+        .unwrap_or(f64::INFINITY)
+}
+
 /// Whether one turns left before another that comes from the opposite direction and does not.
 fn turns_left_before(one: &Course, other: &Course) -> bool {
     let opposite =
@@ -209,9 +223,9 @@ impl Course {
             .line_m
             .filter(|line| *line < place && line - front > -OVER_M);
         let at_line = line
-            .map(|line| stopping_before(&self.now, line))
+            .map(|line| slowing_before(&self.now, line, 0.0))
             .filter(|speed| speed.is_finite());
-        Some(at_line.unwrap_or_else(|| stopping_before(&self.now, place)))
+        Some(at_line.unwrap_or_else(|| slowing_before(&self.now, place, 0.0)))
     }
 
     /// Whether it has yet to stop at a sign.
@@ -254,7 +268,7 @@ impl Course {
             return None;
         }
         let place = self.meets(other)?.own.0 - BEFORE_M;
-        Some(stopping_before(&self.now, place))
+        Some(slowing_before(&self.now, place, 0.0))
     }
 
     /// Whether it has to let another pass that it meets; `is_later` says who comes there first.
@@ -405,6 +419,23 @@ mod tests {
         let [own, other] = [own, other].map(|now| courses(map, lights, &now));
         let of = |one: &[Course], to: &Vec<Course>| yielding_speed(one, &std::iter::once(&to[..]));
         (of(&own, &other), of(&other, &own))
+    }
+
+    #[test]
+    fn stop_signs_are_rolled_past_at_most() {
+        let (signed, open) = (crossing(&[1]), crossing(&[]));
+        let speed = |map: &MapGraph, x: f64, speed: f64| {
+            let now = car((x, 0.0), WEST, speed);
+            speed_for_signs(&courses(map, &Lights::default(), &now))
+        };
+        // 7.75 m before the line; half a second later it slows down at 3 m/s² to 2.5 m/s there.
+        let before = speed(&signed, 30.0, 8.0);
+        let left = 7.75 - 0.5 * before;
+        assert!((before * before - 2.0 * 3.0 * left - 2.5 * 2.5).abs() < 1e-9);
+        assert_eq!(speed(&signed, 37.7, 2.0), 2.5);
+        assert_eq!(speed(&signed, 41.0, 2.0), f64::INFINITY);
+        assert_eq!(speed(&signed, 37.7, 8.0), f64::INFINITY);
+        assert_eq!(speed(&open, 30.0, 8.0), f64::INFINITY);
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Sampling rules for the relative network: moves that would overlap an agent, leave the road, run a
-//! red light, lead into an occupied junction or take the right of way are redrawn, and kinematically
-//! impossible moves are limited.
+//! red light or a stop sign, lead into an occupied junction or take the right of way are redrawn, and
+//! kinematically impossible moves are limited.
 //!
 //! They are those of the sequence network (`rejection`, `kinematic_limits`). That network predicts
 //! three poses at once; here the second part of the checked horizon, one second, continues the
@@ -18,7 +18,7 @@ use crate::kinematic_limits::Limits;
 use crate::rejection::{BRAKING, Footprints, Member, POSES, Way, way};
 use crate::relative::approach::{HARDEST_MPS2, OVER_M};
 use crate::relative::keep_clear::closed_entry;
-use crate::relative::right_of_way::{Course, courses, yielding_speed};
+use crate::relative::right_of_way::{Course, courses, speed_for_signs, yielding_speed};
 
 // The thresholds are chosen by hand; none has been varied in a measurement.
 
@@ -171,7 +171,8 @@ pub(super) struct Shut<'l> {
     lights: Vec<(&'l StopLine, LightState)>,
     /// Those before occupied junctions, by agent.
     entries: Vec<Option<StopLine>>,
-    /// The greatest speed for those that have the right of way, by agent, metres per second.
+    /// The greatest speed for those that have the right of way and for stop signs, by agent, metres per
+    /// second.
     most: Vec<f64>,
 }
 
@@ -205,7 +206,8 @@ impl<'l> Shut<'l> {
         let most = |i: usize| {
             let others = ways.iter().enumerate();
             let others = others.filter(|(j, _)| *j != i && !is_parked(*j));
-            yielding_speed(&ways[i], &others.map(|(_, way)| &way[..]))
+            let yielding = yielding_speed(&ways[i], &others.map(|(_, way)| &way[..]));
+            yielding.min(speed_for_signs(&ways[i]))
         };
         Self {
             lights: lights.collect(),
@@ -214,18 +216,19 @@ impl<'l> Shut<'l> {
         }
     }
 
-    /// Whether an agent crosses one with this move, or takes another's right of way.
+    /// Whether an agent crosses one with this move, takes another's right of way or is too fast for a
+    /// stop sign.
     pub(super) fn forbids(&self, agents: &[Shown], i: usize, step: Pose) -> bool {
         let now = &agents[i];
         let entry = self.entries[i].as_ref();
         entry.is_some_and(|line| line.is_crossed(now, step))
             || runs_red(now, step, &self.lights)
-            || step.position.length() / TOKEN_DT > self.yielding(now, i)
+            || step.position.length() / TOKEN_DT > self.at_most(now, i)
     }
 
-    /// The greatest speed of an agent for others, metres per second: it brakes no harder than
-    /// [`GENTLY`].
-    fn yielding(&self, now: &Shown, i: usize) -> f64 {
+    /// The greatest speed of an agent for others and for signs, metres per second: it brakes no harder
+    /// than [`GENTLY`].
+    fn at_most(&self, now: &Shown, i: usize) -> f64 {
         self.most[i].max(now.velocity().length() - GENTLY * TOKEN_DT)
     }
 
@@ -280,7 +283,7 @@ pub(super) fn obey_lines(
         if room.is_finite() && (stands || speed * speed / (2.0 * HARDEST_MPS2) <= room) {
             moves[i] = slowed(now, moves[i], room);
         }
-        let (most, length) = (shut.yielding(now, i) * TOKEN_DT, moves[i].position.length());
+        let (most, length) = (shut.at_most(now, i) * TOKEN_DT, moves[i].position.length());
         if length > most {
             moves[i] = match most < CREEPING * TOKEN_DT {
                 true => Pose::IDENTITY,

@@ -11,7 +11,7 @@
 use std::cell::OnceCell;
 
 use gump_engine::relative::approach::{
-    BRAKES_MPS2, before_line, has_sign, lane_under, lanes_under,
+    BRAKES_MPS2, ROLLS_MPS, before_line, has_sign, lane_under, lanes_under,
 };
 use gump_geometry::{Pose, angle_difference};
 use gump_model::relative::graph::{Lights, Shown};
@@ -55,8 +55,6 @@ const AS_LOGGED_MPS: f64 = 0.2;
 /// radians.
 const TURNS_AT_RED_MPS: f64 = 2.0;
 const RIGHT: f64 = 0.52;
-/// The same at stop signs: hardly a recorded driver is faster at the line.
-const ROLLS_MPS: f64 = 2.5;
 /// Most that a vehicle gains in a step, that it loses, and its greatest lateral acceleration times
 /// the duration of a step, metres per second: 4, 8 and 5 m/s².
 const GAINS_MPS: f64 = 2.0;
