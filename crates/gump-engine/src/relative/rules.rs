@@ -36,6 +36,10 @@ const TURNS_AT_RED: f64 = 2.0;
 /// exceeds [`HARDEST_MPS2`].
 const GENTLY: f64 = 4.0;
 
+/// The greatest acceleration in any direction that a dry road allows, metres per second squared. A draw
+/// of standing at 14 m/s is rare, but would stop a car within its own length.
+const GRIP_MPS2: f64 = 8.0;
+
 /// Beyond the place where it could stop, a vehicle looks this far for a junction, metres.
 const LOOK_M: f64 = 2.0;
 
@@ -51,6 +55,7 @@ pub(super) fn kinematically_limited(now: &Shown, step: Pose) -> Pose {
     let Some(limits) = Limits::of(now.body.kind) else {
         return step;
     };
+    let step = with_grip(now, step);
     let moved = AgentState {
         pose: now.pose * step,
         velocity: step.position / TOKEN_DT,
@@ -60,6 +65,21 @@ pub(super) fn kinematically_limited(now: &Shown, step: Pose) -> Pose {
         return step;
     }
     now.pose.inverse() * kept
+}
+
+/// The move nearest to one that tyres allow: velocity changes by no more than [`GRIP_MPS2`].
+fn with_grip(now: &Shown, step: Pose) -> Pose {
+    let before = now.pose.inverse().rotate(now.velocity());
+    let change = (step.position / TOKEN_DT - before).length();
+    let most = GRIP_MPS2 * TOKEN_DT;
+    if change <= most {
+        return step;
+    }
+    let on = Pose {
+        position: before * TOKEN_DT,
+        heading: 0.0,
+    };
+    on.interpolate(step, most / change)
 }
 
 /// The line at which a light stops vehicles.
@@ -668,5 +688,20 @@ mod tests {
         assert!(kept.position.y < 0.5 && kept.heading < 0.3, "{kept:?}");
         let fine = Pose::new(4.0, 0.1, 0.05);
         assert_eq!(kinematically_limited(&car(0.0, 4.0), fine), fine);
+    }
+
+    #[test]
+    fn nobody_stops_or_swerves_harder_than_the_road_holds() {
+        // 14 m/s, of which 4 m/s can be lost in half a second.
+        let stopped = kinematically_limited(&car(0.0, 7.0), Pose::IDENTITY);
+        assert!((stopped.position - DVec2::new(5.0, 0.0)).length() < 1e-9);
+        let swerved = kinematically_limited(&car(0.0, 7.0), Pose::new(6.0, 3.0, 0.8));
+        let change = (swerved.position / TOKEN_DT - DVec2::new(14.0, 0.0)).length();
+        assert!(
+            (change - 4.0).abs() < 1e-9 && swerved.heading < 0.6,
+            "{swerved:?}"
+        );
+        let hard = Pose::new(5.2, 0.0, 0.0);
+        assert_eq!(kinematically_limited(&car(0.0, 7.0), hard), hard);
     }
 }
