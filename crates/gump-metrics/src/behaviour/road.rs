@@ -1,5 +1,10 @@
 //! Leaving the road.
 
+use std::f64::consts::FRAC_PI_6;
+
+use gump_geometry::{Pose, angle_difference};
+use gump_scene::{Lane, MapGraph};
+
 use super::track::Track;
 use super::{Class, Counter, MOVES, Measure, vehicles};
 use crate::metres_off_road;
@@ -10,6 +15,9 @@ const LOOK_S: f64 = 0.5;
 /// A vehicle has left the road when its centre is this far beyond the road's edge, metres: more than
 /// half of it is beside the road. Less is a kerb or a map that is inaccurate. Chosen by hand.
 const BEYOND_M: f64 = 0.5;
+/// Who is this far past the end of a lane that leads nowhere has driven out of the map: as far as one gets
+/// between two looks, metres.
+const PAST_END_M: f64 = 15.0;
 
 impl Counter<'_> {
     /// Nothing is counted on maps without a border.
@@ -51,7 +59,7 @@ impl Counter<'_> {
             };
             if k > self.take.now {
                 n_moving += 1;
-                if was_on && beyond > BEYOND_M {
+                if was_on && beyond > BEYOND_M && !is_past_end(self.map, pose) {
                     exits.push(k);
                 }
             }
@@ -60,4 +68,18 @@ impl Counter<'_> {
         }
         (exits, n_moving)
     }
+}
+
+/// Whether a vehicle has driven on past the end of a lane that leads nowhere, where the map ends.
+fn is_past_end(map: &MapGraph, pose: Pose) -> bool {
+    let is_past = |lane: &Lane| {
+        let way = &lane.centerline;
+        let end = way.pose_at(way.length());
+        let place = end.inverse() * pose.position;
+        (0.0..=PAST_END_M).contains(&place.x)
+            && place.y.abs() <= lane.width / 2.0 + BEYOND_M
+            && angle_difference(pose.heading, end.heading).abs() < FRAC_PI_6
+    };
+    map.lanes_near(pose.position, PAST_END_M)
+        .any(|(lane, _)| map.successors(lane.id).next().is_none() && is_past(lane))
 }
