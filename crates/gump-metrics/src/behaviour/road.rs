@@ -16,8 +16,9 @@ const LOOK_S: f64 = 0.5;
 /// half of it is beside the road. Less is a kerb or a map that is inaccurate. Chosen by hand.
 const BEYOND_M: f64 = 0.5;
 /// Who is this far past the end of a lane that leads nowhere has driven out of the map: as far as one gets
-/// between two looks, metres.
+/// between two looks, metres. It is out until a lane is nearer than the second distance, metres.
 const PAST_END_M: f64 = 15.0;
+const ON_LANE_M: f64 = 2.0;
 
 impl Counter<'_> {
     /// Nothing is counted on maps without a border.
@@ -42,7 +43,7 @@ impl Counter<'_> {
     /// at which it moves.
     fn exits_of(&self, track: &Track) -> (Vec<usize>, usize) {
         let (mut exits, mut n_moving) = (Vec::new(), 0);
-        let mut was_on = false;
+        let (mut was_on, mut is_out) = (false, false);
         for k in (self.take.now..self.take.frames.len()).step_by(self.take.steps(LOOK_S)) {
             let agent = self.take.frames[k].agent(track.id);
             let Some((agent, pose)) = agent.zip(track.pose(k)) else {
@@ -54,12 +55,19 @@ impl Counter<'_> {
                 continue;
             }
             let z = agent.elevation - agent.height / 2.0;
+            let is_on_lane = || {
+                self.map
+                    .lanes_near(pose.position, ON_LANE_M)
+                    .next()
+                    .is_some()
+            };
+            is_out = is_past_end(self.map, pose) || is_out && !is_on_lane();
             let Some(beyond) = metres_off_road(self.map, pose.position, z) else {
                 return (exits, n_moving);
             };
             if k > self.take.now {
                 n_moving += 1;
-                if was_on && beyond > BEYOND_M && !is_past_end(self.map, pose) {
+                if was_on && beyond > BEYOND_M && !is_out {
                     exits.push(k);
                 }
             }

@@ -489,6 +489,13 @@ fn who_drives_out_of_the_map_does_not_leave_the_road() {
     };
     assert_eq!(exits(0.0), 0.0);
     assert_eq!(exits(5.0), 1.0);
+    // Where it turns once it is out is no matter.
+    let rollout = only(&scenario, 0, |pose, t| {
+        let late = (t - 6.5).max(0.0);
+        let heading = if late > 0.0 { f64::atan(1.0) } else { 0.0 };
+        pose * Pose::new(10.0 * t, 10.0 * late, heading)
+    });
+    assert_eq!(events(&scenario, &rollout, Measure::RoadExit), 0.0);
 }
 
 #[test]
