@@ -14,7 +14,7 @@
 //! | `slip` | a vehicle faster than 1 m/s slides sideways at more than 0.5 m/s wherever its rear axle may be | time that vehicles move |
 //! | `red_light` | a vehicle passes the stop line of the lane that it then follows at red | passage of a line whose light is known |
 //! | `lane_change` | a vehicle goes over to a lane beside its own, each held for a second, outside of intersections | minute that vehicles move |
-//! | `road_exit` | the centre of a vehicle that was on the road gets over 0.5 m beyond its edge (see [`metres_off_road`](crate::metres_off_road)), not past the end of a lane where the map ends | minute that vehicles move, on maps with a border |
+//! | `road_exit` | the centre of a vehicle that was on the road gets over 0.5 m beyond its edge (see [`metres_off_road`](crate::metres_off_road)) | minute that vehicles move, on maps with a border |
 //! | `set_off` | who stood for a second goes faster than 1 m/s | minute that agents are there |
 //! | `standing` | over the last second the agent got less than 0.3 m away; at some moments | agent that is there and that the log also sees then |
 //! | `come_to_rest` | a vehicle that drove at 1 to 12 m/s over the last second before the present stands, at the same moments | vehicle that drove so and that the log also sees then |

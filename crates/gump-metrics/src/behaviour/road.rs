@@ -1,10 +1,5 @@
 //! Leaving the road.
 
-use std::f64::consts::FRAC_PI_6;
-
-use gump_geometry::{Pose, angle_difference};
-use gump_scene::{Lane, MapGraph};
-
 use super::track::Track;
 use super::{Class, Counter, MOVES, Measure, vehicles};
 use crate::metres_off_road;
@@ -15,10 +10,6 @@ const LOOK_S: f64 = 0.5;
 /// A vehicle has left the road when its centre is this far beyond the road's edge, metres: more than
 /// half of it is beside the road. Less is a kerb or a map that is inaccurate. Chosen by hand.
 const BEYOND_M: f64 = 0.5;
-/// Who is this far past the end of a lane that leads nowhere has driven out of the map: as far as one gets
-/// between two looks, metres. It is out until a lane is nearer than the second distance, metres.
-const PAST_END_M: f64 = 15.0;
-const ON_LANE_M: f64 = 2.0;
 
 impl Counter<'_> {
     /// Nothing is counted on maps without a border.
@@ -43,7 +34,7 @@ impl Counter<'_> {
     /// at which it moves.
     fn exits_of(&self, track: &Track) -> (Vec<usize>, usize) {
         let (mut exits, mut n_moving) = (Vec::new(), 0);
-        let (mut was_on, mut is_out) = (false, false);
+        let mut was_on = false;
         for k in (self.take.now..self.take.frames.len()).step_by(self.take.steps(LOOK_S)) {
             let agent = self.take.frames[k].agent(track.id);
             let Some((agent, pose)) = agent.zip(track.pose(k)) else {
@@ -55,19 +46,12 @@ impl Counter<'_> {
                 continue;
             }
             let z = agent.elevation - agent.height / 2.0;
-            let is_on_lane = || {
-                self.map
-                    .lanes_near(pose.position, ON_LANE_M)
-                    .next()
-                    .is_some()
-            };
-            is_out = is_past_end(self.map, pose) || is_out && !is_on_lane();
             let Some(beyond) = metres_off_road(self.map, pose.position, z) else {
                 return (exits, n_moving);
             };
             if k > self.take.now {
                 n_moving += 1;
-                if was_on && beyond > BEYOND_M && !is_out {
+                if was_on && beyond > BEYOND_M {
                     exits.push(k);
                 }
             }
@@ -76,18 +60,4 @@ impl Counter<'_> {
         }
         (exits, n_moving)
     }
-}
-
-/// Whether a vehicle has driven on past the end of a lane that leads nowhere, where the map ends.
-fn is_past_end(map: &MapGraph, pose: Pose) -> bool {
-    let is_past = |lane: &Lane| {
-        let way = &lane.centerline;
-        let end = way.pose_at(way.length());
-        let place = end.inverse() * pose.position;
-        (0.0..=PAST_END_M).contains(&place.x)
-            && place.y.abs() <= lane.width / 2.0 + BEYOND_M
-            && angle_difference(pose.heading, end.heading).abs() < FRAC_PI_6
-    };
-    map.lanes_near(pose.position, PAST_END_M)
-        .any(|(lane, _)| map.successors(lane.id).next().is_none() && is_past(lane))
 }

@@ -470,35 +470,6 @@ fn lane_changes_go_to_the_lane_beside() {
 }
 
 #[test]
-fn who_drives_out_of_the_map_does_not_leave_the_road() {
-    // The road ends at 60 m, with a border around it.
-    let text =
-        "lane 1: -50,0 60,0\nedge: -60,-4 62,-4 62,4 -60,4\nego vehicle 0: 0,0 velocity 10,0";
-    let scenario = scenario(text);
-    let exits = |turn: f64| {
-        let rollout = only(&scenario, 0, |pose, t| {
-            let late = (t - 5.0).max(0.0);
-            let heading = if late > 0.0 {
-                f64::atan(turn / 10.0)
-            } else {
-                0.0
-            };
-            pose * Pose::new(10.0 * t, turn * late, heading)
-        });
-        events(&scenario, &rollout, Measure::RoadExit)
-    };
-    assert_eq!(exits(0.0), 0.0);
-    assert_eq!(exits(5.0), 1.0);
-    // Where it turns once it is out is no matter.
-    let rollout = only(&scenario, 0, |pose, t| {
-        let late = (t - 6.5).max(0.0);
-        let heading = if late > 0.0 { f64::atan(1.0) } else { 0.0 };
-        pose * Pose::new(10.0 * t, 10.0 * late, heading)
-    });
-    assert_eq!(events(&scenario, &rollout, Measure::RoadExit), 0.0);
-}
-
-#[test]
 fn who_drives_over_the_edge_leaves_the_road_once() {
     let border = "edge: -100,-4 500,-4\nedge: 500,4 -100,4\n";
     let check = |map: &str, y: f64, aside: fn(f64) -> f64, expected: f64| {
