@@ -44,7 +44,7 @@ pub(crate) struct Draw {
     /// Resample colliding or off-road samples up to N times, 0 for never [default: 12]
     #[arg(long, value_name = "N")]
     redraws: Option<usize>,
-    /// No kinematic limits: vehicles and bicycles may turn on the spot and slip sideways
+    /// No kinematic limits: vehicles and bicycles may turn on the spot, slip sideways and stop at once
     #[arg(long)]
     no_limits: bool,
     /// The network alone: no rejection sampling, no kinematic limits
