@@ -132,7 +132,7 @@ impl StopLine {
     }
 
     /// Whether an agent's front bumper crosses the line with this move, or cannot stop before it
-    /// afterwards.
+    /// afterwards. One that stands with its front over the line crosses it when it moves on.
     fn is_crossed(&self, now: &Shown, step: Pose) -> bool {
         let half = now.body.length / 2.0;
         let to = now.pose * step;
@@ -142,7 +142,10 @@ impl StopLine {
         let (before, after) = (ahead(now.pose), ahead(to));
         let speed = step.position.length() / TOKEN_DT;
         let reach = after.x + speed * speed / (2.0 * GENTLY);
-        along && before.x <= OVER_M && reach > OVER_M && after.y.abs() <= self.width / 2.0
+        let stands = now.velocity().length() < CREEPING;
+        let over = if stands { half } else { OVER_M };
+        let stop = before.x.max(OVER_M);
+        along && before.x <= over && reach > stop && after.y.abs() <= self.width / 2.0
     }
 }
 
@@ -643,11 +646,16 @@ mod tests {
         assert_eq!(settled(car(0.0, 8.0), 8.0, &red, 8.0), 8.0);
         // Over the line already.
         assert_eq!(settled(car(4.0, 4.0), 4.0, &red, 1.0), 4.0);
+        // It stands with its front 1.5 m over the line, or with its middle: the first waits there.
+        assert_eq!(settled(car(4.5, 0.0), 4.0, &red, 4.0), 0.0);
+        assert_eq!(settled(car(4.5, 0.0), 0.0, &red, 4.0), 0.0);
+        assert_eq!(settled(car(5.5, 0.0), 4.0, &red, 1.0), 4.0);
         let right = StopLine {
             is_right: true,
             ..line.clone()
         };
         let red = [(&right, LightState::Red)];
+        assert_eq!(settled(car(4.5, 0.0), 4.0, &red, 1.0), 4.0);
         assert_eq!(settled(car(0.0, 0.5), 4.0, &red, 1.0), 4.0);
         assert_eq!(settled(car(0.0, 2.0), 4.0, &red, 1.0), 1.0);
     }
