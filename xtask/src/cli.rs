@@ -8,6 +8,7 @@ use std::process::ExitCode;
 use clap::{ArgMatches, Command, CommandFactory, FromArgMatches, Parser, Subcommand};
 use gump_data::DataError;
 use gump_eval::EvalError;
+use gump_train::TrainError;
 use serde::Serialize;
 
 use crate::run::{self, Common, Run, print_error};
@@ -184,6 +185,7 @@ pub(crate) fn explain(error: &anyhow::Error) -> ExitCode {
         _ if run::interrupted() => 130,
         error if error.is::<WrongArguments>() || names_nothing(error) => 2,
         error if error.downcast_ref().is_some_and(EvalError::is_argument) => 2,
+        error if matches!(error.downcast_ref(), Some(TrainError::OtherData { .. })) => 2,
         _ => 1,
     })
 }

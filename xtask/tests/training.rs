@@ -219,6 +219,13 @@ fn a_configuration_that_contradicts_what_was_begun_is_refused() {
     place.fails(words, 2, &["weights.safetensors holds another model"]);
     changed("accumulate = 2", "accumulate = 5");
     place.fails("other.toml", 2, &["a batch of 4 cannot be shared"]);
+
+    let checkpoint = || fs::read(place.path("out/checkpoint.safetensors")).unwrap();
+    let before = checkpoint();
+    fs::remove_dir_all(place.path("data/more")).unwrap();
+    let parts = ["began with other data: 2 scenarios", "found 1 scenario ("];
+    place.fails("c.toml --out out --resume", 2, &parts);
+    assert!(checkpoint() == before);
 }
 
 #[test]

@@ -51,6 +51,7 @@ mod deconvolution;
 #[cfg(feature = "tensors")]
 mod draw;
 mod error;
+mod expressible;
 pub mod kinematic_limits;
 pub mod nucleus;
 #[cfg(feature = "tensors")]

@@ -151,6 +151,12 @@ impl FreshScenes {
         Cow::Owned(Arc::unwrap_or_clone(scene))
     }
 
+    /// The stream by name and seed.
+    pub(crate) fn identity(&self) -> String {
+        let SceneStream { profile, seed, .. } = &self.stream;
+        format!("{PREFIX}{}:{}", profile.name(), seed.0)
+    }
+
     /// Scenes generated so far, by any thread.
     #[cfg(test)]
     fn n_generated(&self) -> usize {

@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 
 use gump_data::cache::Cache;
 use gump_scene::{Scenario, Seed};
-use gump_train::{ScenarioSource, TrainError};
+use gump_train::{ScenarioSource, TrainError, identity_of};
 
 use crate::datasets::{Part, read};
 use crate::fresh::{FreshScenes, SceneStream};
@@ -138,6 +138,20 @@ impl ScenarioSource for TrainingSet {
             }
         }
     }
+
+    fn identity(&self) -> String {
+        if let Some(fresh) = &self.fresh {
+            return fresh.identity();
+        }
+        if self.mixed.is_empty() {
+            return identity_of(self.ids());
+        }
+        let parts = self.mixed.iter();
+        let parts: Vec<String> = parts
+            .map(|(share, set)| format!("{share} of {}", set.identity()))
+            .collect();
+        parts.join(", ")
+    }
 }
 
 /// A number in 0..1 from a number drawn at random, and another one drawn at random.
@@ -187,6 +201,13 @@ mod tests {
         };
         let parts = [part(&shard, 2..4), part(&file, 1..3), part(&shard, 5..99)];
         assert_eq!(numbers(&parts), "231256");
+        let identity = |parts: &[Part]| TrainingSet::open(parts, &()).unwrap().identity();
+        assert_eq!(identity(&parts), identity(&parts));
+        assert_ne!(identity(&parts), identity(&parts[..2]));
+        assert_eq!(
+            identity(&[Part::whole(&shard)]),
+            identity(&[Part::whole(&file)])
+        );
         assert_eq!(numbers(&[Part::whole(&shard)]), "0123456");
         assert_eq!(numbers(&[Part::whole(&file)]), "0123456");
     }

@@ -53,6 +53,14 @@ pub enum TrainError {
         /// Frames a sample needs.
         frames: usize,
     },
+    /// A run is resumed with other scenarios than it began with.
+    #[error("the run to resume began with other data: {begun}, found {found}")]
+    OtherData {
+        /// [`identity`](crate::ScenarioSource::identity) of those it began with.
+        begun: String,
+        /// That of the scenarios given.
+        found: String,
+    },
     /// Processes cannot train together, or one of them failed.
     #[error("processes that train together: {0}")]
     ProcessGroup(#[from] ProcessGroupError),

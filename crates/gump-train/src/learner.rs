@@ -14,6 +14,7 @@ use gump_nn::parameters::Parameters;
 use super::config::TrainConfig;
 use super::gradients::Gradients;
 use crate::TrainError;
+use crate::scenes::{DATA, ScenarioSource, check_data};
 
 /// A network in training.
 pub(super) struct TrainState {
@@ -52,8 +53,13 @@ impl TrainState {
     }
 
     /// From a checkpoint, with the training settings.
-    pub(super) fn restore(path: &Path, device: &Device) -> Result<(Self, TrainConfig), TrainError> {
+    pub(super) fn restore(
+        path: &Path,
+        scenarios: &dyn ScenarioSource,
+        device: &Device,
+    ) -> Result<(Self, TrainConfig), TrainError> {
         let mut archive = checkpoint::read(path)?;
+        check_data(&archive, scenarios)?;
         let model = archive.config()?;
         let number = |key: &str| {
             let text = archive.entry(key)?;
@@ -93,7 +99,12 @@ impl TrainState {
 
     /// Writes everything a resumed run needs. The weights to use have the plain names, so that the
     /// file can also be loaded as a network.
-    pub(super) fn save(&self, path: &Path, config: &TrainConfig) -> Result<(), TrainError> {
+    pub(super) fn save(
+        &self,
+        path: &Path,
+        config: &TrainConfig,
+        scenarios: &dyn ScenarioSource,
+    ) -> Result<(), TrainError> {
         let mut tensors = named("", self.shipped());
         if self.average.is_some() {
             tensors.extend(named(checkpoint::TRAINED, &self.network));
@@ -111,6 +122,7 @@ impl TrainState {
         let config = serde_json::to_string(config).map_err(TrainError::Json)?;
         header.insert("train".to_owned(), config);
         header.insert("step".to_owned(), self.step.to_string());
+        header.insert(DATA.to_owned(), scenarios.identity());
         Ok(checkpoint::write(path, tensors, header, StorageType::Full)?)
     }
 

@@ -53,5 +53,5 @@ pub use loss::{LossConfig, LossParts};
 pub use mpi::Mpi;
 pub use process_group::{ProcessGroup, SingleProcess};
 pub use sample::SampleConfig;
-pub use scenes::ScenarioSource;
+pub use scenes::{ScenarioSource, identity_of};
 pub use trainer::{Batch, StepReport, Trainer};

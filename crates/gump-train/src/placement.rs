@@ -27,7 +27,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
 use crate::learner::Update;
-use crate::scenes::ScenarioSource;
+use crate::scenes::{DATA, ScenarioSource, check_data};
 
 /// Maximum number of scenes tried for a sample: more mean that hardly any has two vehicles on roads.
 const ATTEMPTS: u64 = 64;
@@ -174,12 +174,13 @@ impl PlacementTrainer {
     /// Continues the run that a checkpoint holds, exactly as if it had not been interrupted.
     ///
     /// # Errors
-    /// A file that is not a checkpoint of such a run.
+    /// A file that is not a checkpoint of such a run, or other scenarios than it began with.
     pub fn resume(
         path: &Path,
         scenarios: impl ScenarioSource + 'static,
     ) -> Result<Self, TrainError> {
         let mut archive = checkpoint::read(path)?;
+        check_data(&archive, &scenarios)?;
         let text = archive.entry("step")?;
         let step: usize = text
             .parse()
@@ -338,6 +339,7 @@ impl PlacementTrainer {
         let config = serde_json::to_string(&self.config).map_err(TrainError::Json)?;
         header.insert("train".to_owned(), config);
         header.insert("step".to_owned(), self.step.to_string());
+        header.insert(DATA.to_owned(), self.scenarios.identity());
         Ok(checkpoint::write(path, tensors, header, StorageType::Full)?)
     }
 

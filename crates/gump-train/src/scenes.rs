@@ -3,9 +3,14 @@
 use std::borrow::Cow;
 use std::sync::Arc;
 
+use gump_model::checkpoint::Archive;
 use gump_scene::{Frame, Scenario};
+use sha2::{Digest as _, Sha256};
 
 use crate::TrainError;
+
+/// The entry of a checkpoint's header for what the run is trained on.
+pub(crate) const DATA: &str = "data";
 
 /// Scenarios by index, read from many threads at once.
 ///
@@ -33,6 +38,48 @@ pub trait ScenarioSource: Send + Sync {
     /// # Errors
     /// [`TrainError::Source`] for one that cannot be read.
     fn get(&self, index: usize) -> Result<Cow<'_, Scenario>, TrainError>;
+
+    /// A text that differs where scenarios, their order or their shares do: a checkpoint holds it, and a
+    /// run is resumed with the same. Empty where it is unknown; then nothing is compared.
+    fn identity(&self) -> String {
+        String::new()
+    }
+}
+
+/// The [`ScenarioSource::identity`] of scenarios with these ids in this order.
+pub fn identity_of<'a>(ids: impl Iterator<Item = &'a str>) -> String {
+    let (mut hash, mut n) = (Sha256::new(), 0);
+    for id in ids {
+        // No id contains it.
+        hash.update(id);
+        hash.update([0]);
+        n += 1;
+    }
+    let digest = hash.finalize();
+    let hex: String = digest
+        .iter()
+        .take(6)
+        .map(|byte| format!("{byte:02x}"))
+        .collect();
+    let scenarios = if n == 1 { "scenario" } else { "scenarios" };
+    format!("{n} {scenarios} ({hex})")
+}
+
+/// Checks that a run is resumed with the scenarios that it began with.
+pub(crate) fn check_data(
+    archive: &Archive,
+    scenarios: &dyn ScenarioSource,
+) -> Result<(), TrainError> {
+    // Checkpoints of earlier versions do not have it.
+    let begun = archive.entry(DATA).unwrap_or_default();
+    let found = scenarios.identity();
+    if begun.is_empty() || found.is_empty() || begun == found {
+        return Ok(());
+    }
+    Err(TrainError::OtherData {
+        begun: begun.to_owned(),
+        found,
+    })
 }
 
 /// The scenario with another log, of which nothing is copied before.
@@ -56,5 +103,9 @@ impl ScenarioSource for Vec<Scenario> {
 
     fn get(&self, index: usize) -> Result<Cow<'_, Scenario>, TrainError> {
         Ok(Cow::Borrowed(&self[index]))
+    }
+
+    fn identity(&self) -> String {
+        identity_of(self.iter().map(|scenario| scenario.id.as_str()))
     }
 }

@@ -100,13 +100,13 @@ impl Trainer {
     /// Continues a run from its checkpoint, exactly as if it had not been interrupted.
     ///
     /// # Errors
-    /// A file that is not the checkpoint of a run, or no scenario to train on.
+    /// A file that is not the checkpoint of a run, other scenarios than it began with, or none.
     pub fn resume(
         path: &Path,
         scenarios: impl ScenarioSource + 'static,
         device: &Device,
     ) -> Result<Self, TrainError> {
-        let (learner, config) = TrainState::restore(path, device)?;
+        let (learner, config) = TrainState::restore(path, &scenarios, device)?;
         Self::assemble(learner, config, Box::new(scenarios))
     }
 
@@ -351,7 +351,8 @@ impl Trainer {
     /// # Errors
     /// [`TrainError::Model`]; the previous file is intact.
     pub fn save(&self, path: &Path) -> Result<(), TrainError> {
-        self.learner.save(path, &self.config)
+        let scenarios = self.source.scenarios.as_ref();
+        self.learner.save(path, &self.config, scenarios)
     }
 
     /// Steps done.

@@ -11,6 +11,8 @@ use gump_kernels::wide;
 use gump_model::ModelError;
 use gump_model::Network;
 
+use crate::expressible::expressible;
+
 /// The parameters of a network by name.
 pub(super) struct WeightReader<'a> {
     pub(super) network: &'a Network,
@@ -41,20 +43,8 @@ impl WeightReader<'_> {
     /// The numbers called `name`, which the precision can express.
     fn expressible(&self, name: &str) -> Result<Vec<f32>, ModelError> {
         let numbers = self.get(name)?;
-        let (form, largest) = match self.precision {
-            Precision::F32 => return Ok(numbers),
-            Precision::Bf16 => ("bfloat16", f32::from(half::bf16::MAX)),
-            Precision::Int8 => ("8 bits", f32::MAX),
-        };
-        let fits = |number: &f32| number.is_finite() && number.abs() <= largest;
-        match numbers.iter().find(|number| !fits(number)) {
-            None => Ok(numbers),
-            Some(&number) => Err(ModelError::WeightNotFinite {
-                name: name.to_owned(),
-                number,
-                form,
-            }),
-        }
+        expressible(name, &numbers, self.precision)?;
+        Ok(numbers)
     }
 
     /// Rows `first..first + n` of the linear layer called `name`.

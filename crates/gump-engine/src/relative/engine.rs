@@ -17,6 +17,7 @@ use gump_model::relative::map::{PIECE_NUMBERS, VectorMap};
 use gump_model::relative::{RelativeConfig, RelativeWeights};
 use gump_scene::Seed;
 
+use crate::expressible::expressible;
 use crate::nucleus::{least_kept, uniform};
 
 /// Number of frames kept of an agent: the present and all that the network attends to.
@@ -123,7 +124,7 @@ impl RelativeEngine {
     /// Packs the weights.
     ///
     /// # Errors
-    /// Weights with a missing parameter.
+    /// Weights with a missing parameter, or with a number that the precision cannot express.
     pub fn new(weights: &RelativeWeights, precision: Precision) -> Result<Self, ModelError> {
         let config = weights.config().clone();
         let c = config.width;
@@ -134,7 +135,9 @@ impl RelativeEngine {
             })
         };
         let linear_in = |name: &str, n_in: usize, precision: Precision| {
-            let weight = get(&format!("{name}.weight"))?;
+            let name_of_weight = format!("{name}.weight");
+            let weight = get(&name_of_weight)?;
+            expressible(&name_of_weight, weight, precision)?;
             let bias = weights.find(&format!("{name}.bias"));
             Ok::<_, ModelError>(Panels::new(weight, n_in, bias, precision))
         };
@@ -173,6 +176,7 @@ impl RelativeEngine {
             y
         };
         let head = get("decoder.head.weight")?;
+        expressible("decoder.head.weight", head, precision)?;
         let of_field = |field: usize| {
             let rows = &head[first_bin(field) * c..(first_bin(field) + BINS[field]) * c];
             Panels::new(rows, c, None, precision)
@@ -487,5 +491,44 @@ mod tests {
             ),
             4000
         );
+    }
+
+    #[cfg(feature = "tensors")]
+    #[test]
+    fn weights_without_end_are_refused_by_name() {
+        use candle_core::{Device, Tensor};
+        use gump_model::relative::RelativeNetwork;
+
+        let config = RelativeConfig {
+            width: 16,
+            layers: 1,
+            heads: 2,
+            edge_width: 8,
+            edge_hidden: 16,
+            ..RelativeConfig::default()
+        };
+        let network = RelativeNetwork::random(config, Seed(1), &Device::Cpu).unwrap();
+        for name in ["layers.0.queries.weight", "decoder.head.weight"] {
+            let weight = network.parameters().find(name).unwrap();
+            let plain = weight.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+            let build = |number: f32, precision| {
+                let mut numbers = plain.clone();
+                numbers[7] = number;
+                let tensor = Tensor::from_slice(&numbers, weight.shape(), weight.device());
+                weight.set(&tensor.unwrap()).unwrap();
+                let built = RelativeEngine::new(&RelativeWeights::of(&network).unwrap(), precision);
+                built.map(|_| ()).map_err(|error| error.to_string())
+            };
+            for (precision, form) in [(Precision::Bf16, "bfloat16"), (Precision::Int8, "8 bits")] {
+                let why = build(f32::INFINITY, precision).unwrap_err();
+                assert!(
+                    why.contains(name) && why.contains("inf") && why.contains(form),
+                    "{why}"
+                );
+                assert!(build(plain[7], precision).is_ok());
+            }
+            // The largest f32 is beyond the largest bfloat16.
+            assert!(build(f32::MAX, Precision::Bf16).is_err());
+        }
     }
 }

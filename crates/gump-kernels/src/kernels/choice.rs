@@ -164,18 +164,7 @@ impl Choice {
     /// another one is already in use.
     pub fn force(kernel: Kernel) -> Result<&'static Self, KernelError> {
         let best = Self::best();
-        let refuse = |why: String| Err(KernelError(why));
-        if !kernel.is_present() {
-            let best = best.kernel;
-            return refuse(format!(
-                "this processor has no kernel {kernel}, its best is {best}"
-            ));
-        }
-        if !kernel.is_right() {
-            return refuse(format!(
-                "kernel {kernel} multiplies wrongly on this processor"
-            ));
-        }
+        usable(kernel, best.kernel, Kernel::is_present, Kernel::is_right)?;
         let forced = Self {
             kernel,
             forced: true,
@@ -184,18 +173,23 @@ impl Choice {
         let choice = CHOSEN.get_or_init(|| forced);
         if choice.kernel != kernel {
             let other = choice.kernel;
-            return refuse(format!(
+            return Err(KernelError(format!(
                 "kernel {kernel} comes too late, {other} is at work"
-            ));
+            )));
         }
         Ok(choice)
     }
 
     fn best() -> Self {
+        Self::first_of(Kernel::is_present, Kernel::is_right)
+    }
+
+    /// The best kernel that is present and right. The portable one is always both.
+    fn first_of(is_present: impl Fn(Kernel) -> bool, is_right: impl Fn(Kernel) -> bool) -> Self {
         let (mut kernel, mut wrong) = (Kernel::Portable, Vec::new());
         for candidate in Kernel::ALL {
-            if candidate.is_present() {
-                if candidate.is_right() {
+            if is_present(candidate) {
+                if is_right(candidate) {
                     kernel = candidate;
                     break;
                 }
@@ -208,6 +202,27 @@ impl Choice {
             wrong,
         }
     }
+}
+
+/// Refuses a kernel that the processor lacks, or that multiplies wrongly on it: on a real one with a
+/// fault, or on an emulated one.
+fn usable(
+    kernel: Kernel,
+    best: Kernel,
+    is_present: impl Fn(Kernel) -> bool,
+    is_right: impl Fn(Kernel) -> bool,
+) -> Result<(), KernelError> {
+    if !is_present(kernel) {
+        return Err(KernelError(format!(
+            "this processor has no kernel {kernel}, its best is {best}"
+        )));
+    }
+    if !is_right(kernel) {
+        return Err(KernelError(format!(
+            "kernel {kernel} multiplies wrongly on this processor"
+        )));
+    }
+    Ok(())
 }
 
 /// Whether a unit's product of odd sizes is that of rounded numbers, in f64, but for the rounding
@@ -267,4 +282,31 @@ fn are_bytes_right(unit: Amx) -> bool {
     let rows: [&[u8]; 16] = std::array::from_fn(|r| &bytes[r * DEPTH..][..DEPTH]);
     let (sums, done) = super::amx::byte_tile(unit, &bytes, &panel);
     done == DEPTH && sums == portable::byte_tile(rows, &panel)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_kernel_that_multiplies_wrongly_is_not_used_and_named() {
+        let is_present = |kernel| kernel != Kernel::Amx;
+        let is_right = |kernel| !matches!(kernel, Kernel::Avx512Bf16 | Kernel::Avx2);
+        let choice = Choice::first_of(is_present, is_right);
+        assert_eq!(choice.kernel, Kernel::Avx512);
+        assert_eq!(choice.wrong, [Kernel::Avx512Bf16]);
+        let refused = |kernel| {
+            let why = usable(kernel, choice.kernel, is_present, is_right).unwrap_err();
+            why.to_string()
+        };
+        assert_eq!(
+            refused(Kernel::Avx2),
+            "kernel avx2 multiplies wrongly on this processor"
+        );
+        assert_eq!(
+            refused(Kernel::Amx),
+            "this processor has no kernel amx, its best is avx512"
+        );
+        assert!(usable(Kernel::Portable, choice.kernel, is_present, is_right).is_ok());
+    }
 }

@@ -25,7 +25,7 @@ use crate::TrainError;
 use crate::learner::Update;
 use crate::relative::drives::{NetworkDriver, RelativeDrives};
 use crate::relative::rewards::{Group, Judged, RelativeRewards};
-use crate::scenes::ScenarioSource;
+use crate::scenes::{DATA, ScenarioSource, check_data};
 
 /// Maximum number of scenes tried for a sample: more mean that hardly any is long enough.
 const ATTEMPTS: u64 = 64;
@@ -261,13 +261,14 @@ impl RelativeTrainer {
     /// Continues a run from its checkpoint, exactly as if it had not been interrupted.
     ///
     /// # Errors
-    /// A file that is not the checkpoint of a run, or no scenario to train on.
+    /// A file that is not the checkpoint of a run, other scenarios than it began with, or none.
     pub fn resume(
         path: &Path,
         scenarios: impl ScenarioSource + 'static,
         device: &Device,
     ) -> Result<Self, TrainError> {
         let mut archive = checkpoint::read(path)?;
+        check_data(&archive, &scenarios)?;
         let model = gump_model::relative::config(&archive)?;
         let text = archive.entry("step")?;
         let step: usize = text
@@ -458,6 +459,7 @@ impl RelativeTrainer {
         let config = serde_json::to_string(&self.config).map_err(TrainError::Json)?;
         header.insert("train".to_owned(), config);
         header.insert("step".to_owned(), self.step.to_string());
+        header.insert(DATA.to_owned(), self.source.scenarios.identity());
         Ok(checkpoint::write(path, tensors, header, StorageType::Full)?)
     }
 
