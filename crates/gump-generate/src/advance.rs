@@ -13,7 +13,7 @@ use gump_geometry::OrientedBox;
 use gump_model::decoder::Bins;
 use gump_model::local_frame::LocalFrame;
 use gump_model::placed_slot::PlacedSlot;
-use gump_scene::{AgentKind, Seed};
+use gump_scene::{AgentKind, ScenarioTag, Seed};
 use gump_tokenizer::{Key, QuantizedState};
 use rayon::prelude::*;
 
@@ -237,8 +237,18 @@ fn judge(
     }
 }
 
-/// The reason for rejecting a vehicle that stands in a lane without cause. An ego with prompts is
-/// exempt.
+/// Prompts that begin so ask for an ego that stands, or for a place where one does without a reason.
+const STANDING: [&str; 6] = [
+    "stationary",
+    "waiting",
+    "on_carpark",
+    "on_pickup_dropoff",
+    "low_magnitude_speed",
+    "near_pedestrian_at_pickup_dropoff",
+];
+
+/// The reason for rejecting a vehicle that stands in a lane without cause. An ego whose prompts ask for
+/// it is exempt.
 fn stands_without(
     query: &Query<'_, '_>,
     state: &QuantizedState,
@@ -246,11 +256,13 @@ fn stands_without(
 ) -> Option<String> {
     let prepared = query.partial.prepared;
     let request = prepared.request;
+    let stands = |tag: &ScenarioTag| STANDING.iter().any(|begin| tag.name().starts_with(begin));
+    let is_told = request.ego.velocity.is_some() || request.prompts.iter().any(stands);
     let is_asked = request.config.standing_has_reasons
         && request.config.placement == Placement::Guided
         && query.rules.kind != AgentKind::Pedestrian
         && query.rules.spec.speed.is_none()
-        && !(query.key.is_ego() && (!request.prompts.is_empty() || request.ego.velocity.is_some()));
+        && !(query.key.is_ego() && is_told);
     if !is_asked {
         return None;
     }

@@ -11,7 +11,8 @@
 //!
 //! * The others are boxes without velocities, since those drawn later are not there yet. A junction
 //!   ahead is therefore a reason by itself; the metric, and starts after nine seconds, look for
-//!   traffic that approaches it.
+//!   traffic that approaches it. In a junction only another agent ahead is one: who stands there is in
+//!   the way of all others for as long as it waits.
 //! * A way ahead is the rest of the lane joined with one following lane, and everything is measured
 //!   along the joined line. The other two measure on each lane by itself (`gump_scene::LaneAhead`)
 //!   and follow lanes as far as they look; near the seam of two lanes the results differ, and with
@@ -51,13 +52,12 @@ pub(crate) fn stands_without(
         return false;
     }
     let Some(lane) = lane_of(own.pose, map) else {
-        return false;
+        // Nobody parks in a junction.
+        let mut near = map.lanes_near(own.pose.position, IN_LANE_M);
+        return near.any(|(lane, _)| lane.in_intersection);
     };
     let from = lane.centerline.project(own.pose.position).arc_length;
     let front = own.length / 2.0;
-    if lane.in_intersection {
-        return false;
-    }
     // Every path ahead must be free: a vehicle that waits to turn has one that is not.
     !ways(map, lane, from).iter().any(|(lanes, way)| {
         let is_held_by_line = lanes.iter().any(|lane| {
@@ -81,7 +81,9 @@ pub(crate) fn stands_without(
             let gap = foot.arc_length - front - other.length / 2.0;
             foot.arc_length > 0.0 && gap < NEXT_M && foot.distance < BESIDE_M
         });
-        is_held_by_line || lanes.iter().any(|lane| enters(&lane)) || is_blocked
+        let is_held = is_held_by_line || lanes.iter().any(|lane| enters(&lane));
+        // Who is in a junction already has passed its line.
+        (is_held && !lane.in_intersection) || is_blocked
     })
 }
 
@@ -152,6 +154,25 @@ mod tests {
         let open = fixture::scenario("lane 1: 0,0 60,0\nego vehicle 0: 30,0").unwrap();
         let ego = open.present().ego_now().oriented_box();
         assert!(!stands_without(&ego, 3.0, &open.map, &[], &[]));
+        let crossing = |x: f64, heading: f64, other: Option<f64>| {
+            let scenario = fixture::scenario(
+                "lane 1: 0,0 60,0 next 2\nlane 2: 60,0 80,0 next 3\nlane 3: 80,0 120,0\nego vehicle 0: 0,0",
+            )
+            .unwrap();
+            let mut parts = scenario.map.parts().clone();
+            parts.lanes[1].in_intersection = true;
+            let map = MapGraph::new(parts).unwrap();
+            let boxed = |x: f64, heading: f64| OrientedBox {
+                pose: Pose::new(x, 0.2, heading),
+                length: 4.6,
+                width: 1.9,
+            };
+            let others: Vec<OrientedBox> = other.map(|x| boxed(x, 0.0)).into_iter().collect();
+            stands_without(&boxed(x, heading), 0.0, &map, &[], &others)
+        };
+        assert!(!crossing(56.0, 0.0, None) && !crossing(70.0, 0.0, Some(79.0)));
+        // In the junction for nothing, along the lane or across it.
+        assert!(crossing(70.0, 0.0, None) && crossing(70.0, 0.9, None));
         assert!(stands_without(&ego, 0.0, &open.map, &[], &[]));
     }
 }

@@ -4,8 +4,7 @@ use std::borrow::Cow;
 use std::sync::Arc;
 
 use gump_model::checkpoint::Archive;
-use gump_scene::{Frame, Scenario};
-use sha2::{Digest as _, Sha256};
+use gump_scene::{Frame, Scenario, Seed};
 
 use crate::TrainError;
 
@@ -48,21 +47,15 @@ pub trait ScenarioSource: Send + Sync {
 
 /// The [`ScenarioSource::identity`] of scenarios with these ids in this order.
 pub fn identity_of<'a>(ids: impl Iterator<Item = &'a str>) -> String {
-    let (mut hash, mut n) = (Sha256::new(), 0);
+    let (mut hash, mut n) = (Seed(0), 0);
     for id in ids {
-        // No id contains it.
-        hash.update(id);
-        hash.update([0]);
+        hash = id.bytes().fold(hash, |hash, byte| hash.fork(byte.into()));
+        // No byte of an id.
+        hash = hash.fork(256);
         n += 1;
     }
-    let digest = hash.finalize();
-    let hex: String = digest
-        .iter()
-        .take(6)
-        .map(|byte| format!("{byte:02x}"))
-        .collect();
     let scenarios = if n == 1 { "scenario" } else { "scenarios" };
-    format!("{n} {scenarios} ({hex})")
+    format!("{n} {scenarios} ({:016x})", hash.0)
 }
 
 /// Checks that a run is resumed with the scenarios that it began with.

@@ -35,6 +35,8 @@ const ALONG: f64 = 0.35;
 /// The same of agents that were seen to drive, which may stand across their lane or between two.
 /// Made for one film of a drop-off (result 23).
 const ASTRAY_M: f64 = 2.5;
+/// In a junction, where there is space between lanes and nobody parks, metres.
+const ASTRAY_INSIDE_M: f64 = 4.0;
 const TURNED: f64 = 0.9;
 /// Distance ahead within which lights and crossing traffic are considered, metres.
 const LOOK_M: f64 = 25.0;
@@ -98,7 +100,7 @@ struct Room {
 /// `agents` are all of the frame.
 pub(super) fn free_to_go(map: &MapGraph, lights: &[Light], agents: &[Standing]) -> Vec<usize> {
     let is_patient = |one: &Standing| one.patience_s.is_infinite() || one.waited_s <= INSIDE_S;
-    let inside = |one: &Standing| !is_patient(one) && is_inside(map, &one.agent);
+    let inside = |one: &Standing| !is_patient(one) && is_inside(map, one);
     let inside: Vec<bool> = agents.iter().map(inside).collect();
     let waits = |i: &usize| inside[*i] || agents[*i].waited_s > agents[*i].patience_s;
     let waiting: Vec<usize> = (0..agents.len()).filter(waits).collect();
@@ -149,9 +151,14 @@ pub(super) fn free_to_go(map: &MapGraph, lights: &[Light], agents: &[Standing]) 
     next
 }
 
-/// Whether an agent is on a lane of a junction.
-fn is_inside(map: &MapGraph, agent: &Agent) -> bool {
-    let mut near = map.lanes_near(agent.state.pose.position, IN_LANE_M);
+/// Whether an agent is on a lane of a junction, or was driving and is between its lanes.
+fn is_inside(map: &MapGraph, one: &Standing) -> bool {
+    let beside = if one.has_driven {
+        ASTRAY_INSIDE_M
+    } else {
+        IN_LANE_M
+    };
+    let mut near = map.lanes_near(one.agent.state.pose.position, beside);
     near.next().is_some_and(|(lane, _)| lane.in_intersection)
 }
 
@@ -177,7 +184,7 @@ fn meet(own: &[LaneAhead<'_>], its: &[LaneAhead<'_>]) -> bool {
 fn ahead<'m>(map: &'m MapGraph, standing: &Standing) -> Vec<LaneAhead<'m>> {
     let agent = &standing.agent;
     let (beside, turned) = match (agent.kind, standing.has_driven) {
-        (AgentKind::Vehicle | AgentKind::Bicycle, true) => (ASTRAY_M, TURNED),
+        (AgentKind::Vehicle | AgentKind::Bicycle, true) => (ASTRAY_INSIDE_M, TURNED),
         (AgentKind::Vehicle, false) => (IN_LANE_M, ALONG),
         (AgentKind::Bicycle, false) => (BESIDE_M, ALONG),
         _ => return Vec::new(),
@@ -188,7 +195,8 @@ fn ahead<'m>(map: &'m MapGraph, standing: &Standing) -> Vec<LaneAhead<'m>> {
         let heading = lane.centerline.pose_at(at).heading;
         (angle_difference(heading, pose.heading).abs() < turned).then_some(at)
     };
-    let mut near = map.lanes_near(pose.position, beside);
+    let near = map.lanes_near(pose.position, beside);
+    let mut near = near.filter(|(lane, metres)| *metres <= ASTRAY_M || lane.in_intersection);
     let Some((lane, at)) = near.find_map(|(lane, _)| Some((lane, along(lane)?))) else {
         return Vec::new();
     };
@@ -262,6 +270,8 @@ fn holds(
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
     use gump_scene::{AgentId, Scenario, fixture};
 
     use super::*;
@@ -332,7 +342,14 @@ mod tests {
             assert!(free(&astray(pose), &waited).is_empty(), "{pose}");
             assert_eq!(free_after(true, &astray(pose), &waited), [0], "{pose}");
         }
-        assert!(free_after(true, &astray("20,4"), &waited).is_empty());
+        assert!(free_after(true, &astray("20,3.8"), &waited).is_empty());
+        // Between the lanes of a junction nobody parks.
+        let mut junction = astray("20,3.8");
+        let mut parts = junction.map.parts().clone();
+        parts.lanes[0].in_intersection = true;
+        junction.map = Arc::new(MapGraph::new(parts).unwrap());
+        assert_eq!(free_after(true, &junction, &waited), [0]);
+        assert!(free(&junction, &waited).is_empty());
     }
 
     #[test]

@@ -60,7 +60,10 @@ const WAITED_S: f64 = 4.0;
 /// spread that agents that have stood since the start do not start together. Chosen on recorded/tune
 /// and SUMO's scenes of a minute (result 23).
 const PATIENCE_S: [f64; 2] = [9.0, 27.0];
-/// The speed of such an agent, metres per second. With 2 m/s vehicles start more often than in the
+/// A slower agent loses its patience, too, metres per second: who stands in another's way creeps by
+/// centimetres now and then, and waits no less.
+const CREEPS: f64 = 0.5;
+/// The speed of a restarted agent, metres per second. With 2 m/s vehicles start more often than in the
 /// log (result 23).
 const START: f64 = 1.0;
 /// After as many steps, nine seconds, vehicles without a reason to slow down are shown without
@@ -335,6 +338,8 @@ struct Member {
     seen: ObservedAgent,
     /// Time that it has stood, seconds, as far as it was observed.
     waited: f64,
+    /// Time for which it has been slower than [`CREEPS`], seconds.
+    idle: f64,
     /// Whether it was faster than [`DRIVES`] in a frame since.
     has_driven: bool,
     /// Whether it stands in a lane although nothing holds it.
@@ -402,6 +407,9 @@ impl Future {
             future.shown_lights = lights_at(&state.history[..=index], state.dt);
             future.see(engine, frame, &predicted);
             future.read(engine, &mut room);
+        }
+        for member in &mut future.members {
+            member.recall(state.history, stride);
         }
         Ok(future)
     }
@@ -566,14 +574,14 @@ impl Future {
         let mut is_one_waiting = false;
         for member in &mut self.members {
             member.could_go = false;
-            is_one_waiting |= member.waited > PATIENCE_S[0];
+            is_one_waiting |= member.idle > PATIENCE_S[0];
             let is_long = member.waited > WAITED_S && stands_in_lane(map, &member.agent);
             limits.push(is_long.then_some(WAITED_S));
         }
         if is_one_waiting {
             let members = self.members.iter().map(|member| Standing {
                 agent: member.agent,
-                waited_s: member.waited,
+                waited_s: member.idle,
                 patience_s: match driven == Some(member.agent.id) {
                     true => f64::INFINITY,
                     false => self.patience_s(member),
@@ -782,6 +790,7 @@ impl Member {
             agent: *agent,
             seen: ObservedAgent::first(engine, body(agent), state.pose, state.velocity),
             waited: 0.0,
+            idle: 0.0,
             has_driven: state.speed() > DRIVES,
             could_go: false,
         }
@@ -791,11 +800,31 @@ impl Member {
         self.seen.now()
     }
 
+    /// What a history tells that is longer than what the network sees of it: whether the agent drove
+    /// before, and for how long it has been idle.
+    fn recall(&mut self, history: &[Frame], stride: usize) {
+        let states = history.iter().rev().step_by(stride);
+        let states = states.map_while(|frame| frame.agent(self.agent.id));
+        let states: Vec<AgentState> = states.map(|agent| agent.state).collect();
+        if states.len() <= KEPT {
+            return;
+        }
+        self.has_driven |= states.iter().any(|state| state.speed() > DRIVES);
+        let metres = |pair: &[AgentState]| pair[0].pose.position.distance(pair[1].pose.position);
+        let idle = states.windows(2);
+        let idle = idle.take_while(|pair| metres(pair) < CREEPS * TOKEN_DT);
+        self.idle = self.idle.max(idle.count() as f64 * TOKEN_DT);
+    }
+
     /// Half a second later it is here; its velocity is what it moved by.
     fn push(&mut self, state: AgentState) {
         self.seen.push(state.pose);
         self.waited = match self.now().velocity() == DVec2::ZERO {
             true => self.waited + TOKEN_DT,
+            false => 0.0,
+        };
+        self.idle = match self.now().velocity().length() < CREEPS {
+            true => self.idle + TOKEN_DT,
             false => 0.0,
         };
         self.has_driven |= self.now().velocity().length() > DRIVES;

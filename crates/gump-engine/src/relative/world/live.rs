@@ -243,4 +243,32 @@ mod tests {
         live.go_on(&world, None);
         assert!(live.future.members[0].could_go);
     }
+
+    #[test]
+    fn a_long_history_tells_who_drove_and_who_has_been_idle() {
+        let road = "lane 1: 0,0 160,0 speed 15\nego vehicle 0: 50,0\ndt 0.5";
+        let (world, mut scenario) = (world(), fixture::scenario(road).unwrap());
+        let ego = *scenario.present().ego_now();
+        // Two seconds at 8 m/s, then six in which it creeps by a decimetre each.
+        let at = |k: i32| {
+            let mut agent = ego;
+            let (x, speed) = match k {
+                ..=4 => (50.0 - 4.0 * f64::from(4 - k), 8.0),
+                _ => (50.0 + 0.1 * f64::from(k - 4), 0.2),
+            };
+            agent.state.pose.position.x = x;
+            agent.state.velocity.x = speed;
+            Frame::new(vec![agent], Vec::new())
+        };
+        scenario.log = (0..=16).map(at).collect();
+        scenario.now = 16;
+        let live = LiveFuture::begin(&world, scenario.present(), Seed(4)).unwrap();
+        let member = &live.future.members[0];
+        assert!(member.has_driven);
+        assert_eq!((member.idle, member.waited), (6.0, 0.0));
+        scenario.log.drain(..12);
+        scenario.now = 4;
+        let live = LiveFuture::begin(&world, scenario.present(), Seed(4)).unwrap();
+        assert!(!live.future.members[0].has_driven);
+    }
 }
