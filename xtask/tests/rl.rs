@@ -231,6 +231,19 @@ fn a_run_that_diverges_leaves_its_last_good_checkpoint() {
 }
 
 #[test]
+fn a_run_of_rounds_that_diverges_says_so() {
+    let place = Workplace::new();
+    let too_fast = CONFIG.replace("[ppo]\n", "[ppo]\nlearning_rate = 1e38\n");
+    fs::write(place.path("c.toml"), too_fast).unwrap();
+    place.fails(
+        &format!("{TRAIN} ppo --out fast"),
+        1,
+        "learning diverged at",
+    );
+    assert!(!place.path("fast/policy.safetensors").exists());
+}
+
+#[test]
 fn the_table_goes_on_without_a_policy_that_diverges() {
     let place = Workplace::new();
     place.results(

@@ -155,7 +155,8 @@ impl AdamW {
         Ok(Self { moments, steps })
     }
 
-    /// One step; returns the norm of the gradient before clipping.
+    /// One step; returns the norm of the gradient before clipping. A gradient that is not finite changes
+    /// nothing, and neither is its norm.
     pub fn step(
         &mut self,
         parameters: &Parameters,
@@ -168,6 +169,9 @@ impl AdamW {
         let squares = all.into_par_iter().map(ops::sum_of_squares);
         let squares: Vec<f64> = squares.collect::<Result<_>>()?;
         let norm = squares.iter().sum::<f64>().sqrt();
+        if !norm.is_finite() {
+            return Ok(norm);
+        }
         let scale = if norm > config.clip {
             config.clip / norm
         } else {

@@ -47,6 +47,12 @@ pub enum TrainError {
         /// First loss that is not finite.
         field: String,
     },
+    /// The loss is finite and its gradient is not.
+    #[error("the gradient is not a number at step {step}; the last checkpoint is intact")]
+    GradientNotFinite {
+        /// Optimiser step.
+        step: usize,
+    },
     /// There is nothing to train on.
     #[error("no scenario offers {frames} consecutive frames at 2 Hz to train on")]
     NoData {

@@ -196,6 +196,8 @@ pub(crate) struct Update<'a> {
 impl Update<'_> {
     /// Moves the parameters along the gradients and the average towards them, and counts the step.
     /// Returns the norm of the gradients before clipping, and the learning rate.
+    ///
+    /// Error: [`TrainError::GradientNotFinite`], and nothing has changed.
     pub(crate) fn learn(
         &self,
         state: &mut AdamW,
@@ -204,6 +206,9 @@ impl Update<'_> {
     ) -> Result<(f64, f64), TrainError> {
         let rate = self.optimizer.rate(*step, self.steps);
         let norm = state.step(self.parameters, gradients, self.optimizer, rate)?;
+        if !norm.is_finite() {
+            return Err(TrainError::GradientNotFinite { step: *step });
+        }
         *step += 1;
         if let Some((average, stays)) = self.average {
             // At first the average is of the steps done so far.

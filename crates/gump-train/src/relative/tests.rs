@@ -7,10 +7,14 @@ use gump_model::checkpoint;
 use gump_model::relative::graph::{Body, NODE_NUMBERS};
 use gump_model::relative::sample::{SampleConfig, State, Track, draw};
 use gump_model::relative::{RelativeConfig, RelativeNetwork, grid, is_relative, load, sample};
+use gump_nn::OptimizerConfig;
+use gump_nn::optimizer::AdamW;
 use gump_rollout::{SimulateConfig, Start, WorldModel as _, simulate};
 use gump_scene::{Scenario, Seed, fixture};
 
 use super::*;
+use crate::gradients::Gradients;
+use crate::learner::Update;
 
 fn config() -> RelativeConfig {
     RelativeConfig {
@@ -84,6 +88,30 @@ fn a_deeper_network_goes_on_from_what_it_said() {
     let sum = added.abs().unwrap().sum_all().unwrap();
     assert!(sum.to_scalar::<f32>().unwrap() > 0.0);
     assert_ne!(before, hidden(trainer.network()).unwrap());
+}
+
+#[test]
+fn a_gradient_without_end_changes_nothing() {
+    let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
+    let parameters = network.parameters();
+    let (name, var) = parameters.trainable().next().unwrap();
+    let numbers = || var.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    let (before, mut step) = (numbers(), 3);
+    let mut state = AdamW::new(parameters).unwrap();
+    let update = Update {
+        parameters,
+        average: None,
+        optimizer: &OptimizerConfig::default(),
+        steps: 10,
+    };
+    let gradient = (var.zeros_like().unwrap() + f64::INFINITY).unwrap();
+    let gradients = Gradients::from([(name.to_owned(), gradient)]);
+    let error = update.learn(&mut state, &mut step, &gradients).unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "the gradient is not a number at step 3; the last checkpoint is intact"
+    );
+    assert_eq!((step, numbers()), (3, before));
 }
 
 #[test]
