@@ -246,7 +246,7 @@ mod tests {
 
     #[test]
     fn a_long_history_tells_who_drove_and_who_has_been_idle() {
-        let road = "lane 1: 0,0 160,0 speed 15\nego vehicle 0: 50,0\ndt 0.5";
+        let road = "lane 1: 0,0 160,0 speed 15\nego vehicle 0: 50,0\nhistory 1.0 future 1.0 dt 0.5";
         let (world, mut scenario) = (world(), fixture::scenario(road).unwrap());
         let ego = *scenario.present().ego_now();
         // Two seconds at 8 m/s, then six in which it creeps by a decimetre each.
