@@ -229,8 +229,8 @@ fn judge(
     let (map, world_from_scene) = (&prepared.request.map, prepared.scene.world_from_scene);
     let outline = rules.outline(&state, map, world_from_scene);
     let broken = rules.broken(&state, &outline, map, world_from_scene);
-    let stands = || stands_without(query, &state, &outline).filter(|_| !is_late);
-    let broken = broken.or_else(stands);
+    let holds_up = || holds_up_traffic(query, &state, &outline).filter(|_| !is_late);
+    let broken = broken.or_else(holds_up);
     match broken {
         Some(clause) if !query.key.is_ego() || clause.starts_with("speed") => Err(clause),
         _ => Ok((state, outline)),
@@ -247,9 +247,9 @@ const STANDING: [&str; 6] = [
     "near_pedestrian_at_pickup_dropoff",
 ];
 
-/// The reason for rejecting a vehicle that stands in a lane without cause. An ego whose prompts ask for
-/// it is exempt.
-fn stands_without(
+/// The reason for rejecting a vehicle that stands in a lane without cause, or that will meet another in
+/// a junction. An ego whose prompts ask for standing may stand.
+fn holds_up_traffic(
     query: &Query<'_, '_>,
     state: &QuantizedState,
     outline: &OrientedBox,
@@ -260,19 +260,21 @@ fn stands_without(
     let is_told = request.ego.velocity.is_some() || request.prompts.iter().any(stands);
     let is_asked = request.config.standing_has_reasons
         && request.config.placement == Placement::Guided
-        && query.rules.kind != AgentKind::Pedestrian
-        && query.rules.spec.speed.is_none()
-        && !(query.key.is_ego() && is_told);
+        && query.rules.kind != AgentKind::Pedestrian;
     if !is_asked {
         return None;
     }
+    let may_stand = query.rules.spec.speed.is_some() || (query.key.is_ego() && is_told);
     let world = |own: &OrientedBox| OrientedBox {
         pose: prepared.scene.world_from_scene * own.pose,
         ..*own
     };
     let others: Vec<OrientedBox> = query.rules.taken.iter().map(world).collect();
-    let speed = state.velocity().length();
+    let (own, speed) = (world(outline), state.velocity().length());
     let (map, lights) = (&request.map, &request.lights);
-    reason::stands_without(&world(outline), speed, map, lights, &others)
-        .then(|| "speed: nothing holds it back".into())
+    if !may_stand && reason::stands_without(&own, speed, map, lights, &others) {
+        return Some("speed: nothing holds it back".into());
+    }
+    reason::meets_in_junction(&own, map, &others)
+        .then(|| "position: it meets another in a junction".into())
 }

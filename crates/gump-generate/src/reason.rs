@@ -40,6 +40,12 @@ const NEXT_M: f64 = 12.0;
 /// car.
 const BESIDE_M: f64 = 1.8;
 
+/// Vehicles are at least as long as this, metres: people and bicycles get past.
+const SHORTEST_M: f64 = 2.5;
+/// Vehicles in a junction meet if they are nearer than this, metres, at more than this angle, radians.
+const MEETING_M: f64 = 25.0;
+const CROSSES: f64 = 0.6;
+
 /// True if a box, world frame, stands in a lane without a reason.
 pub(crate) fn stands_without(
     own: &OrientedBox,
@@ -85,6 +91,22 @@ pub(crate) fn stands_without(
         // Who is in a junction already has passed its line.
         (is_held && !lane.in_intersection) || is_blocked
     })
+}
+
+/// True if a vehicle is in a junction across the way of another one in it. Drawn one after another,
+/// both may be fast, and they meet within a second.
+pub(crate) fn meets_in_junction(own: &OrientedBox, map: &MapGraph, others: &[OrientedBox]) -> bool {
+    let is_inside = |one: &OrientedBox| {
+        let mut near = map.lanes_near(one.pose.position, IN_LANE_M);
+        near.next().is_some_and(|(lane, _)| lane.in_intersection)
+    };
+    let is_near = |other: &&OrientedBox| {
+        let turned = angle_difference(own.pose.heading, other.pose.heading).abs();
+        other.length >= SHORTEST_M
+            && own.pose.position.distance(other.pose.position) < MEETING_M
+            && (CROSSES..std::f64::consts::PI - CROSSES).contains(&turned)
+    };
+    own.length >= SHORTEST_M && is_inside(own) && others.iter().filter(is_near).any(is_inside)
 }
 
 /// The lane in whose middle an agent is, if there is one.
@@ -167,6 +189,11 @@ mod tests {
                 length: 4.6,
                 width: 1.9,
             };
+            let meets =
+                |x: f64, turn: f64| meets_in_junction(&boxed(70.0, 0.0), &map, &[boxed(x, turn)]);
+            // Across its way in the junction, along it, and before the junction.
+            assert!(meets(77.0, 1.2) && !meets(77.0, 0.2) && !meets(77.0, 3.0));
+            assert!(!meets(50.0, 1.2));
             let others: Vec<OrientedBox> = other.map(|x| boxed(x, 0.0)).into_iter().collect();
             stands_without(&boxed(x, heading), 0.0, &map, &[], &others)
         };
