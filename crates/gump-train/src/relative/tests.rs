@@ -146,10 +146,10 @@ fn train_config(steps: usize) -> RelativeTrainConfig {
     RelativeTrainConfig {
         steps,
         batch: 2,
-        optimizer: gump_nn::OptimizerConfig {
+        optimizer: OptimizerConfig {
             learning_rate: 3e-3,
             warmup: 5,
-            ..gump_nn::OptimizerConfig::default()
+            ..OptimizerConfig::default()
         },
         ..RelativeTrainConfig::default()
     }
