@@ -505,7 +505,6 @@ mod tests {
             heads: 2,
             edge_width: 8,
             edge_hidden: 16,
-            ..RelativeConfig::default()
         };
         let network = RelativeNetwork::random(config, Seed(1), &Device::Cpu).unwrap();
         for name in ["layers.0.queries.weight", "decoder.head.weight"] {
