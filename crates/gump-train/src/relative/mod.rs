@@ -11,6 +11,6 @@ mod train;
 
 pub use self::crowd::Crowd;
 pub use self::drives::RelativeDrives;
-pub use self::rewards::RelativeRewards;
+pub use self::rewards::{RelativeRewards, RewardExclusions};
 pub use self::train::{RelativeStep, RelativeTrainConfig, RelativeTrainer};
 pub use gump_model::relative::RelativeSampleConfig;

@@ -86,6 +86,18 @@ pub(super) struct Group {
     pub(super) samples: Vec<Sample>,
     /// Metametric of all of them together.
     pub(super) realism: f64,
+    /// What is left out of it and was before it.
+    pub(super) excluded: RewardExclusions,
+}
+
+/// What rewards of realism have left out.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct RewardExclusions {
+    /// Scenes that cannot be compared with their log (too short, without road edges, with another time
+    /// step), or whose futures all earn the same.
+    pub scenes: usize,
+    /// Agents of compared scenes that are not scored, because they are not in the log throughout.
+    pub agents: usize,
 }
 
 /// A snapshot of the network at a step, which is rolled out.
@@ -142,8 +154,18 @@ impl Judged {
         let Some(worth) = worth.filter(|_| realism.is_finite()) else {
             return Ok(None);
         };
+        let now = scenario.log[scenario.now].agents().iter();
+        let agents = now.filter(|agent| !worth.agents.contains(&agent.id));
+        let excluded = RewardExclusions {
+            scenes: 0,
+            agents: agents.count(),
+        };
         let samples = judged(&scenario, &futures, &worth);
-        Ok(samples.map(|samples| Group { samples, realism }))
+        Ok(samples.map(|samples| Group {
+            samples,
+            realism,
+            excluded,
+        }))
     }
 }
 

@@ -522,13 +522,20 @@ fn rollouts_are_judged_by_the_moves_they_made() {
     assert!(n > 100 && (sum / f64::from(n)).abs() < 0.1, "{sum} of {n}");
     let too_short = fixture::scenario(
         "lane 1: 0,0 60,0\nego vehicle 0: 10,0 velocity 8,0\nhistory 1.0 future 2.0 dt 0.1",
-    );
-    assert!(
-        judged
-            .group(&too_short.unwrap(), Seed(2))
-            .unwrap()
-            .is_none()
-    );
+    )
+    .unwrap();
+    assert!(judged.group(&too_short, Seed(2)).unwrap().is_none());
+    // Scenes that are of no use are counted; all five agents of the other one are scored.
+    let scenes = vec![too_short.clone(), too_short, scenario()];
+    let train = RelativeTrainConfig {
+        realism: Some(config.clone()),
+        ..train_config(4)
+    };
+    let mut trainer = RelativeTrainer::new(self::config(), train, scenes, &Device::Cpu).unwrap();
+    (0..4).for_each(|_| _ = trainer.step().unwrap());
+    let excluded = trainer.reward_exclusions();
+    assert!(excluded.scenes > 0, "{excluded:?}");
+    assert_eq!(excluded.agents, 0);
     let alone = RelativeRewards {
         rollouts: 1,
         ..RelativeRewards::default()

@@ -24,7 +24,7 @@ use serde::{Deserialize, Serialize};
 use crate::TrainError;
 use crate::learner::Update;
 use crate::relative::drives::{NetworkDriver, RelativeDrives};
-use crate::relative::rewards::{Group, Judged, RelativeRewards};
+use crate::relative::rewards::{Group, Judged, RelativeRewards, RewardExclusions};
 use crate::scenes::{DATA, ScenarioSource, check_data};
 
 /// Maximum number of scenes tried for a sample: more mean that hardly any is long enough.
@@ -141,6 +141,7 @@ pub struct RelativeTrainer {
     source: Arc<BatchSource>,
     /// The network that drives the agents of samples, as of the last update.
     driving: Option<RelativeNetwork>,
+    excluded: RewardExclusions,
     next: Receiver<Result<Batch, TrainError>>,
 }
 
@@ -180,7 +181,8 @@ impl BatchSource {
             let seed = seed.fork(attempt);
             let scenario = self.scenarios.pick(step, seed.fork(0).0);
             let scenario = self.scenarios.get(scenario)?;
-            if let Some(group) = judged.group(&scenario, seed.fork(1))? {
+            if let Some(mut group) = judged.group(&scenario, seed.fork(1))? {
+                group.excluded.scenes = attempt as usize;
                 return Ok(group);
             }
         }
@@ -321,14 +323,21 @@ impl RelativeTrainer {
             step,
             source,
             driving,
+            excluded: RewardExclusions::default(),
             next,
         })
+    }
+
+    /// What rewards of realism have left out since the run began or was resumed.
+    pub fn reward_exclusions(&self) -> RewardExclusions {
+        self.excluded
     }
 
     /// One optimiser step.
     ///
     /// # Errors
-    /// [`TrainError::LossNotFinite`] before anything is changed, or errors of drawing samples.
+    /// [`TrainError::LossNotFinite`] or [`TrainError::GradientNotFinite`] before anything is changed, or
+    /// errors of drawing samples.
     pub fn step(&mut self) -> Result<RelativeStep, TrainError> {
         let drawn = self.next.recv();
         let Batch { samples, group } = drawn.unwrap_or(Err(TrainError::NoData { frames: 3 }))?;
@@ -338,6 +347,12 @@ impl RelativeTrainer {
         }
         let drivers = drivers(self.driving.as_ref(), &self.config)?;
         self.next = prefetch(&self.source, self.step + 1, drivers);
+        let left_out = group
+            .as_ref()
+            .map(|group| group.excluded)
+            .unwrap_or_default();
+        self.excluded.scenes += left_out.scenes;
+        self.excluded.agents += left_out.agents;
         let total = weight(&samples);
         let (network, smoothing) = (&self.trained, self.config.smoothing_bins);
         let operands = match self.config.mixed_precision {

@@ -168,6 +168,9 @@ fn train(
     trained?;
     run.result("parameters", trainer.network().parameters().count())?;
     report_run(run, &trainer, &losses, resumed_at, began)?;
+    if trainer.config().realism.is_some() {
+        run.result("reward_exclusions", trainer.reward_exclusions())?;
+    }
     if let Some(last) = losses.last() {
         let names = ["stands", "ahead", "left", "turn"];
         let fields = names.iter().zip(&last.loss.fields);
