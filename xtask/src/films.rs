@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use gump_scene::{Rollout, Scenario};
+use gump_scene::{Rollout, Scenario, SceneState};
 use gump_viz::{Film, FilmSpec, LabelledRollout, can_encode_mp4, grid_film, log_as_rollout};
 use serde::Serialize;
 
@@ -45,6 +45,10 @@ enum CameraName {
     /// Follows the ego
     Follow,
 }
+
+/// Most frames of a film: three minutes at 10 Hz. Longer ones have fewer a second; an hour of all took
+/// eight minutes to write.
+const MOST_FRAMES: usize = 1800;
 
 impl FilmArgs {
     /// Refuses what cannot be written here, before anything is simulated.
@@ -120,6 +124,21 @@ fn beside_log(
     spec: fn(&[&Rollout], (u32, u32)) -> FilmSpec,
 ) -> anyhow::Result<Film> {
     let log = log_until(scenario, futures);
+    let longest = futures.iter().map(|(_, rollout)| rollout.steps()).max();
+    let every = longest.unwrap_or_default().div_ceil(MOST_FRAMES).max(1);
+    let thin: Vec<(&str, Rollout)> = match every {
+        1 => Vec::new(),
+        _ => {
+            let all = futures.iter();
+            all.map(|(label, rollout)| (*label, thinned(rollout, every)))
+                .collect()
+        }
+    };
+    let thin: Vec<(&str, &Rollout)> = thin.iter().map(|(label, take)| (*label, take)).collect();
+    let (log, futures) = match every {
+        1 => (log, futures),
+        _ => (thinned(&log, every), &thin[..]),
+    };
     let known = (log.steps() > 0).then_some(("log", &log));
     let takes: Vec<_> = known
         .into_iter()
@@ -142,6 +161,18 @@ fn beside_log(
         ..spec(&rollouts, (side, side))
     };
     Ok(grid_film(&takes, &spec)?)
+}
+
+/// Every so many steps of a rollout.
+fn thinned(rollout: &Rollout, every: usize) -> Rollout {
+    let mut thin = Rollout::begin(SceneState {
+        dt: rollout.dt() * every as f64,
+        ..rollout.at(0)
+    });
+    let kept = rollout.imagined().chunks_exact(every);
+    kept.filter_map(<[_]>::last)
+        .for_each(|frame| thin.push(frame.clone()));
+    thin
 }
 
 /// The log for as long as the futures last: where they end, nothing is left to compare.
@@ -172,6 +203,29 @@ pub(crate) fn first_few(rollouts: &[Rollout]) -> Vec<(&'static str, &Rollout)> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn long_films_have_fewer_frames_a_second() {
+        let scenario = gump_scene::fixture::scenario(
+            "ego vehicle 0: 0,0 velocity 5,0\nhistory 1 future 2 dt 0.1",
+        )
+        .unwrap();
+        let log = log_as_rollout(&scenario);
+        let thin = thinned(&log, 6);
+        assert_eq!(
+            (thin.steps(), thin.history().len()),
+            (3, log.history().len())
+        );
+        assert!((thin.dt() - 0.6).abs() < 1e-9);
+        let x = thin.imagined()[2]
+            .agent(thin.ego())
+            .unwrap()
+            .state
+            .pose
+            .position
+            .x;
+        assert!((x - 9.0).abs() < 1e-9, "{x}");
+    }
 
     #[test]
     fn the_log_ends_with_the_futures() {

@@ -9,18 +9,33 @@ use gump_scene::{Agent, AgentId, Rollout, Scenario};
 use gump_viz::{Camera, Picture, PictureSpec, draw_futures};
 use serde_json::json;
 
+/// Most numbers of an array: half a gigabyte. Agents that come and leave have a column each, so that an
+/// hour of traffic at 10 Hz would be four.
+const MOST_NUMBERS: usize = 1 << 26;
+
 /// Writes `futures.npy`, shape [future, step, agent, number], and `futures.json`, which says what
-/// the rows are.
+/// the rows are. Of long futures with many agents it has every k-th step only, and k is returned.
 ///
 /// Numbers are x, y, heading, vx, vy in the world frame as f64; an absent agent is NaN.
 pub(crate) fn save_array(
     folder: &Path,
     scenario: &Scenario,
     rollouts: &[Rollout],
-) -> anyhow::Result<()> {
+) -> anyhow::Result<usize> {
+    save_thinned(folder, scenario, rollouts, MOST_NUMBERS)
+}
+
+fn save_thinned(
+    folder: &Path,
+    scenario: &Scenario,
+    rollouts: &[Rollout],
+    most: usize,
+) -> anyhow::Result<usize> {
     let agents = agents(rollouts);
     let steps = rollouts.first().map_or(0, Rollout::steps);
-    let shape = [rollouts.len(), steps, agents.len(), 5];
+    let whole = rollouts.len() * steps * agents.len() * 5;
+    let every = whole.div_ceil(most).max(1);
+    let shape = [rollouts.len(), steps / every, agents.len(), 5];
     let path = folder.join("futures.npy");
     gump_data::write_atomically(&path, |file| {
         let mut write = |bytes: &[u8]| {
@@ -28,7 +43,8 @@ pub(crate) fn save_array(
                 .with_context(|| format!("cannot write {}", path.display()))
         };
         write(&npy_header(shape))?;
-        for frame in rollouts.iter().flat_map(Rollout::imagined) {
+        let kept = |rollout| Rollout::imagined(rollout).chunks_exact(every);
+        for frame in rollouts.iter().flat_map(kept).filter_map(<[_]>::last) {
             for agent in &agents {
                 let numbers = frame.agent(agent.id).map_or([f64::NAN; 5], numbers);
                 for number in numbers {
@@ -43,7 +59,7 @@ pub(crate) fn save_array(
         "axes": ["future", "step", "agent", "number"],
         "shape": shape,
         "numbers": ["x", "y", "heading", "vx", "vy"],
-        "dt": scenario.dt,
+        "dt": scenario.dt * every as f64,
         "ego": scenario.ego.0,
         "agents": agents.iter().map(|agent| json!({
             "id": agent.id.0,
@@ -56,7 +72,8 @@ pub(crate) fn save_array(
     gump_data::write_atomically(&path, |file| {
         serde_json::to_writer_pretty(file, &index)
             .with_context(|| format!("cannot write {}", path.display()))
-    })
+    })?;
+    Ok(every)
 }
 
 /// Every agent of any frame, by id, as it is first seen.
@@ -124,5 +141,17 @@ mod tests {
         // The ego after one step of 0.1 s at 5 m/s.
         let x = f64::from_le_bytes(bytes[header.len()..][..8].try_into().unwrap());
         assert!((x - 0.5).abs() < 1e-9, "{x}");
+
+        // 400 numbers, at most 150: every third of twenty steps.
+        let every = save_thinned(folder.path(), &scenario, &rollouts, 150).unwrap();
+        let bytes = std::fs::read(folder.path().join("futures.npy")).unwrap();
+        let header = npy_header([2, 6, 2, 5]);
+        assert!(every == 3 && bytes.starts_with(&header));
+        assert_eq!(bytes.len(), header.len() + 2 * 6 * 2 * 5 * 8);
+        let x = f64::from_le_bytes(bytes[header.len()..][..8].try_into().unwrap());
+        assert!((x - 1.5).abs() < 1e-9, "{x}");
+        let index = std::fs::read_to_string(folder.path().join("futures.json")).unwrap();
+        let index: serde_json::Value = serde_json::from_str(&index).unwrap();
+        assert!((index["dt"].as_f64().unwrap() - 0.3).abs() < 1e-9);
     }
 }

@@ -153,7 +153,13 @@ impl Args {
         rollouts: &'a [Rollout],
         mut viewer: Viewer<'a>,
     ) -> anyhow::Result<()> {
-        futures::save_array(run.out(), scenario, rollouts)?;
+        let every = futures::save_array(run.out(), scenario, rollouts)?;
+        if every > 1 {
+            let dt = scenario.dt * every as f64;
+            run.print(&format!(
+                "futures.npy has a step every {dt:.1} s: all would take over half a gigabyte"
+            ));
+        }
         let wanted = |format| self.format.contains(&format);
         if wanted(Format::Waymo) {
             submission::write_rollouts(&run.path("rollouts.binproto"), &scenario.id, rollouts)?;
