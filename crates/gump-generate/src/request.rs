@@ -140,9 +140,9 @@ pub struct GenerateConfig {
     /// vehicles are on the road.
     pub parks_off_road: bool,
     /// Whether a vehicle that stands in a lane needs a reason: a light, a sign, a junction or
-    /// another agent ahead; and whether no two vehicles may be across each other's ways in a junction. In
-    /// guided placement only. It makes scenes less like recorded ones, but
-    /// their rollouts better.
+    /// another agent ahead, in a junction an agent ahead; and whether no two vehicles may be across each
+    /// other's ways in a junction. In guided placement only. It makes scenes less like recorded ones,
+    /// but their rollouts better.
     pub standing_has_reasons: bool,
     /// Whether the network reads the prompts as tokens. Without them, prompts still choose the place
     /// and which scenes are accepted.

@@ -35,9 +35,9 @@ const ALONG: f64 = 0.35;
 /// The same of agents that were seen to drive, which may stand across their lane or between two.
 /// Made for one film of a drop-off (result 23).
 const ASTRAY_M: f64 = 2.5;
-/// In a junction, where there is space between lanes and nobody parks, metres.
-const ASTRAY_INSIDE_M: f64 = 4.0;
 const TURNED: f64 = 0.9;
+/// [`ASTRAY_M`] in a junction, where there is space between lanes and nobody parks.
+const ASTRAY_INSIDE_M: f64 = 4.0;
 /// Distance ahead within which lights and crossing traffic are considered, metres.
 const LOOK_M: f64 = 25.0;
 /// Space beside the path for people, from the side of the agent, metres, unless they have stood
