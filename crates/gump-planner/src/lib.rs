@@ -96,7 +96,7 @@ pub use drivers::{ImitationDriver, LogDriver, NuplanIdmDriver, SimpleDriver};
 pub use error::PlanError;
 pub use interactive::{
     Aggregate, Allocation, CandidateEvaluation, CandidateScore, Decision, InteractiveDriver,
-    InteractiveDriverConfig, Phases, PlanBudget, ValueEstimate,
+    InteractiveDriverConfig, Phases, PlanBudget, ValueEstimate, WarmStart,
 };
 pub use pdm::{PdmClosed, PdmConfig, PdmScore, Side};
 pub use proposal::{Proposal, ProposalKind};

@@ -51,6 +51,11 @@ pub enum ProposalKind {
     },
     /// The world's own motion of the ego.
     Imitation,
+    /// One draw of the world's own motion of the ego, which stays the same whatever the others do.
+    NetworkMode {
+        /// From 1, the mode that most draws are near first; a mode under way keeps its number.
+        index: usize,
+    },
     /// Braking straight ahead as hard as allowed.
     EmergencyBrake,
 }
@@ -86,6 +91,7 @@ impl fmt::Display for ProposalKind {
                 )
             }
             Self::Imitation => f.write_str("imitation"),
+            Self::NetworkMode { index } => write!(f, "network mode {index}"),
             Self::EmergencyBrake => f.write_str("emergency brake"),
         }
     }

@@ -14,7 +14,7 @@ use gump_nuplan::tracking::Trajectory;
 use gump_planner::closed_loop::{drive_and_score, evaluate};
 use gump_planner::{
     Explain, ImitationDriver, InteractiveDriver, InteractiveDriverConfig, LogDriver,
-    NuplanIdmDriver, PdmClosed, SimpleDriver,
+    NuplanIdmDriver, PdmClosed, SimpleDriver, WarmStart,
 };
 use gump_rollout::BoxError;
 use gump_rollout::worlds::Idm;
@@ -59,12 +59,19 @@ fn every_driver_comes_home_on_a_map_without_roadblocks() {
         replan_every: 10,
         ..InteractiveDriverConfig::default()
     };
-    let drivers: [Box<dyn Explain>; 6] = [
+    let taking_over = InteractiveDriverConfig {
+        warm_start: WarmStart::Rest,
+        network_modes: 3,
+        n_futures: 2,
+        ..policies.clone()
+    };
+    let drivers: [Box<dyn Explain>; 7] = [
         Box::new(LogDriver::new(&case.0, &[])),
         Box::new(NuplanIdmDriver::default()),
         Box::new(SimpleDriver::default()),
         Box::new(PdmClosed::default()),
         Box::new(InteractiveDriver::new(&world, policies).unwrap()),
+        Box::new(InteractiveDriver::new(&world, taking_over).unwrap()),
         Box::new(ImitationDriver::new(&world, 1, 10, Seed(0)).unwrap()),
     ];
     for mut driver in drivers {

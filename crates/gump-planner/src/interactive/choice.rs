@@ -99,6 +99,11 @@ pub(super) struct Judged {
 const WEIGHTS: [f64; 4] = [5.0, 5.0, 4.0, 2.0];
 
 impl Judged {
+    /// The total, 0 to 1.
+    pub(super) fn total(&self) -> f64 {
+        self.total
+    }
+
     fn terms(&self) -> [f64; 4] {
         let parts = &self.parts;
         [
@@ -234,10 +239,12 @@ pub(super) struct Tally {
     hedge: Option<Judged>,
     /// Deducted from the value.
     cost: f64,
+    /// Of a candidate that rests: for how many decisions, and its last value.
+    rest: Option<(usize, f64)>,
 }
 
 /// The value by which a candidate is chosen.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Standing {
     value: f64,
     collisions: usize,
@@ -267,9 +274,17 @@ impl Tally {
         self.hedge = Some(score);
     }
 
-    /// The ego's motion in the first future.
-    pub(super) fn first_drive(&self) -> &[EgoState] {
-        &self.futures[0].drive
+    /// Instead of futures in the world, the one in which others keep their velocity, with its frames;
+    /// the value is the `value` of the last decision in which it was simulated, `rests` decisions ago.
+    pub(super) fn rest(
+        &mut self,
+        future: CandidateFuture,
+        score: Judged,
+        rests: usize,
+        value: f64,
+    ) {
+        (self.futures, self.scores) = (vec![future], vec![score]);
+        self.rest = Some((rests, value));
     }
 
     fn score(&self) -> CandidateScore {
@@ -329,10 +344,11 @@ impl Tally {
         }
         CandidateEvaluation {
             kind,
-            value: standing.value,
+            value: self.rest.map_or(standing.value, |(_, value)| value),
             score,
             hedge,
             finalist,
+            rests: self.rest.map_or(0, |(rests, _)| rests),
             collisions: standing.collisions,
             progress_m: standing.progress_m,
             collision_s: standing.collision_s,
@@ -342,16 +358,25 @@ impl Tally {
     }
 }
 
-/// The better half of some candidates, at least two, in their order.
+/// The better half of so many candidates, at least two.
+pub(super) fn half(n: usize) -> usize {
+    n.div_ceil(2).max(2)
+}
+
+/// The best `n` of some candidates with futures, in their order.
 pub(super) fn best_of(
     tallies: &[Tally],
     among: &[usize],
+    n: usize,
     config: &InteractiveDriverConfig,
 ) -> Vec<usize> {
-    let standing: Vec<Standing> = tallies.iter().map(|tally| tally.standing(config)).collect();
+    let mut standing = vec![Standing::default(); tallies.len()];
+    for &i in among {
+        standing[i] = tallies[i].standing(config);
+    }
     let mut left = among.to_vec();
     let mut kept = Vec::new();
-    while kept.len() < among.len().div_ceil(2).max(2) && !left.is_empty() {
+    while kept.len() < n && !left.is_empty() {
         let best = first_of(&standing, &left, None, 0.0);
         left.retain(|&i| i != best);
         kept.push(best);

@@ -1,5 +1,6 @@
 //! Rollouts of candidates: policies and world take turns, half a second each.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use gump_geometry::Pose;
@@ -9,7 +10,8 @@ use gump_rollout::{BoxError, RolloutError, Session, Start, WorldModel};
 use gump_scene::{AgentId, AgentState, EgoState, Frame, Rollout, SceneState, Seed};
 use rayon::prelude::*;
 
-use super::choice::{Reward, Tally, best_of};
+use super::choice::{Judged, Reward, Tally, best_of, half};
+use super::modes::Following;
 use super::policies::{self, Policy};
 use super::{Allocation, Decision, InteractiveDriverConfig, Phases, steps};
 use crate::pdm::forecast::{Forecast, MOMENT_DT};
@@ -39,6 +41,12 @@ pub(super) struct Imagination<'a> {
     pub(super) speeds: &'a [f64],
     pub(super) input: &'a PlannerInput<'a>,
     pub(super) clock: &'a dyn Fn() -> Duration,
+    /// The last decision of this drive.
+    pub(super) last: Option<&'a Decision>,
+    /// Number of decisions before this one.
+    pub(super) n_decisions: usize,
+    /// The drive of the world's ego that is followed.
+    pub(super) following: Option<&'a Following>,
 }
 
 /// Past states, a tenth of a second apart, used for comfort: nuPlan's longest filter needs 1.5 s,
@@ -46,14 +54,14 @@ pub(super) struct Imagination<'a> {
 const COMFORT_PAST: usize = 20;
 
 /// Separates the random numbers of later rounds from those of iterations, which never reach it.
-const ROUND: u64 = 1 << 32;
+pub(super) const ROUND: u64 = 1 << 32;
 
 /// Some futures of some candidates, simulated together.
 #[derive(Clone, Copy)]
-struct Round<'a> {
+pub(super) struct Round<'a> {
     /// Time at which the decision began.
-    began: Duration,
-    scene: SceneState<'a>,
+    pub(super) began: Duration,
+    pub(super) scene: SceneState<'a>,
     proposer: &'a Proposer<'a>,
     /// The corridor of every line.
     corridors: &'a [Corridor],
@@ -92,12 +100,22 @@ pub(super) struct CandidateFuture {
     policy: Proposal,
     /// Car-following law of the policy.
     law: IdmConfig,
+    /// The fixed drive of a mode, from now on.
+    course: Option<Arc<[EgoState]>>,
     /// States of the car that tracks it, from now on.
     pub(super) drive: Vec<EgoState>,
     /// Frames of the world, one per decision; shorter where the future was dropped.
     pub(super) frames: Vec<Frame>,
     /// True once the future can have no value any more: it is not simulated further.
     lost: bool,
+}
+
+/// A candidate before it has driven: a policy with the law that it drives by, or a fixed drive.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Begun {
+    policy: Proposal,
+    law: IdmConfig,
+    course: Option<Arc<[EgoState]>>,
 }
 
 impl<'a> Imagination<'a> {
@@ -112,21 +130,34 @@ impl<'a> Imagination<'a> {
         };
         let proposer = self.state.proposer(&self.config.proposals.law, self.speeds);
         let policies = policies::all(self.config, self.speeds, self.state.lane_changes());
-        let begun = self.begin(&proposer, &policies);
+        let mut begun = self.begin(&proposer, &policies);
         let corridors: Vec<Corridor> = (0..proposer.lines.len())
             .map(|line| {
                 let place = self.input.ego.rear_axle.position;
                 proposer.corridor(line, proposer.lines[line].project(place))
             })
             .collect();
-        let n_candidates = begun.len() + usize::from(self.config.imitation);
-        let cost = |i: usize| policies.get(i).map_or(0.0, |policy| policy.cost);
-        let mut tallies: Vec<Tally> = (0..n_candidates).map(|i| Tally::new(cost(i))).collect();
-        let mut left: Vec<usize> = (0..n_candidates).collect();
         let mut horizon = steps(&self.config.budget) / DECISION;
-        let rounds = self.config.allocation.rounds(self.config.n_futures);
         // Sessions of a round stay open, so that those of later ones may share what they read.
         let mut opened: Vec<Box<dyn Session + '_>> = Vec::new();
+        let modes = self.modes(scene, began, horizon, &mut opened, &mut phases)?;
+        begun.extend(modes.iter().map(|mode| Begun {
+            course: Some(mode.drive.clone()),
+            ..Begun::default()
+        }));
+        let mut kinds: Vec<ProposalKind> = policies.iter().map(|policy| policy.kind).collect();
+        kinds.extend(modes.iter().map(|mode| mode.kind()));
+        if self.config.imitation {
+            kinds.push(ProposalKind::Imitation);
+        }
+        let cost = |i: usize| policies.get(i).map_or(0.0, |policy| policy.cost);
+        let n_candidates = kinds.len();
+        let mut tallies: Vec<Tally> = (0..n_candidates).map(|i| Tally::new(cost(i))).collect();
+        let mut resting = self.resting(&kinds);
+        let mut left: Vec<usize> = (0..n_candidates)
+            .filter(|&i| resting.iter().all(|rest| rest.candidate != i))
+            .collect();
+        let rounds = self.config.allocation.rounds(self.config.n_futures);
         for (r, &n_futures) in rounds.iter().enumerate() {
             let round = Round {
                 began,
@@ -138,32 +169,61 @@ impl<'a> Imagination<'a> {
                 n_decisions: horizon,
                 seed: self.seed(r),
             };
-            let (futures, imagined) = self.round(&round, &begun, &mut opened, &mut phases)?;
+            let (mut futures, imagined) = self.round(&round, &begun, &mut opened, &mut phases)?;
             if r > 0 && imagined < horizon {
                 // Time is up. What all others were judged by reaches farther.
                 break;
             }
             horizon = imagined;
-            let time = (self.clock)();
-            let scores = self.reward().judge(&futures, n_futures);
+            let mut time = (self.clock)();
+            let mut scores = self.reward().judge(&futures, n_futures);
+            let n_before = left.len() + resting.len();
+            let mut hedged = Vec::new();
+            if r == 0 && (self.config.hedge > 0.0 || !resting.is_empty()) {
+                let own = left.last() == Some(&begun.len());
+                let own = own.then(|| &futures[futures.len() - n_futures]);
+                hedged = self.hedge(&round, &begun, horizon, n_candidates, own);
+            }
+            if r == 0 && !resting.is_empty() {
+                let woken = self.woken(&resting, &left, &scores, &hedged, cost);
+                phases.score += (self.clock)() - time;
+                if !woken.is_empty() {
+                    let again = Round {
+                        candidates: &woken,
+                        n_decisions: horizon,
+                        ..round
+                    };
+                    let (more, reached) = self.round(&again, &begun, &mut opened, &mut phases)?;
+                    if reached == horizon {
+                        let mut all: Vec<(usize, CandidateFuture)> =
+                            left.iter().copied().zip(futures).collect();
+                        all.extend(woken.iter().copied().zip(more));
+                        all.sort_by_key(|(candidate, _)| *candidate);
+                        (left, futures) = all.into_iter().unzip();
+                        resting.retain(|rest| !woken.contains(&rest.candidate));
+                    }
+                }
+                time = (self.clock)();
+                // Progress is relative to the farthest of all.
+                scores = self.reward().judge(&futures, n_futures);
+            }
             let mut judged = futures.into_iter().zip(scores);
             for &candidate in &left {
                 let own = judged.by_ref().take(n_futures);
                 tallies[candidate].add(own);
             }
-            if r == 0 && self.config.hedge > 0.0 {
-                self.hedge(&round, &begun, horizon, &mut tallies);
-            }
+            self.settle(hedged, &resting, scene, &mut tallies);
             if r + 1 < rounds.len() {
-                left = best_of(&tallies, &left, self.config);
+                // Who rests would have dropped out.
+                let n = half(if r == 0 { n_before } else { left.len() });
+                left = best_of(&tallies, &left, n, self.config);
             }
             phases.score += (self.clock)() - time;
         }
         let time = (self.clock)();
-        let evaluations = tallies.into_iter().enumerate().map(|(i, tally)| {
+        let evaluations = tallies.into_iter().zip(&kinds).enumerate();
+        let evaluations = evaluations.map(|(i, (tally, &kind))| {
             let film = |frames| film(scene, frames);
-            let policy = policies.get(i);
-            let kind = policy.map_or(ProposalKind::Imitation, |policy| policy.kind);
             tally.sum_up(kind, left.contains(&i), self.config, film)
         });
         let evaluations = evaluations.collect();
@@ -177,17 +237,20 @@ impl<'a> Imagination<'a> {
         })
     }
 
-    /// Scores every candidate among agents that keep their velocity, as PDM forecasts them. Policies
-    /// drive anew there; imitation, which has none, as it did in its first future.
+    /// Scores all candidates among agents that keep their velocity, as PDM forecasts them. Policies
+    /// drive anew there; imitation, which has none, as it did in its first future, `own`.
     fn hedge(
         &self,
         round: &Round<'_>,
-        begun: &[(Proposal, IdmConfig)],
+        begun: &[Begun],
         n_decisions: usize,
-        tallies: &mut [Tally],
-    ) {
+        n_candidates: usize,
+        own: Option<&CandidateFuture>,
+    ) -> Vec<(CandidateFuture, Judged)> {
+        let all: Vec<usize> = (0..n_candidates).collect();
         let one = Round {
             n_futures: 1,
+            candidates: &all,
             ..*round
         };
         let mut futures = self.futures(&one, begun);
@@ -195,17 +258,15 @@ impl<'a> Imagination<'a> {
         for _ in 0..n_decisions {
             self.drive(one.proposer, one.corridors, &mut futures[..n_ruled]);
         }
-        for (future, tally) in futures.iter_mut().zip(&*tallies).skip(n_ruled) {
-            future.drive = tally.first_drive().to_vec();
+        for (future, own) in futures[n_ruled..].iter_mut().zip(own) {
+            future.drive.clone_from(&own.drive);
         }
         let scores = self.reward().judge(&futures, 1);
-        for (&candidate, score) in round.candidates.iter().zip(scores) {
-            tallies[candidate].hedge(score);
-        }
+        futures.into_iter().zip(scores).collect()
     }
 
     /// Seed of a round: the same for all candidates.
-    fn seed(&self, round: usize) -> Seed {
+    pub(super) fn seed(&self, round: usize) -> Seed {
         let seed = self.config.seed.fork(self.input.iteration as u64);
         match round {
             0 => seed,
@@ -218,7 +279,7 @@ impl<'a> Imagination<'a> {
     fn round(
         &self,
         round: &Round<'_>,
-        begun: &[(Proposal, IdmConfig)],
+        begun: &[Begun],
         opened: &mut Vec<Box<dyn Session + 'a>>,
         phases: &mut Phases,
     ) -> Result<(Vec<CandidateFuture>, usize), PlanError> {
@@ -302,32 +363,40 @@ impl<'a> Imagination<'a> {
     }
 
     /// Policies before they have driven, with the laws they drive by.
-    fn begin(&self, proposer: &Proposer<'_>, policies: &[Policy]) -> Vec<(Proposal, IdmConfig)> {
+    fn begin(&self, proposer: &Proposer<'_>, policies: &[Policy]) -> Vec<Begun> {
         let ego = self.input.ego;
         let begin = |policy: &Policy| {
             let mut begun = proposer.begin(policy.line, ego.rear_axle, ego.velocity.x);
             begun.desired_speed = policy.desired_speed;
-            (begun, policy.law.clone())
+            Begun {
+                policy: begun,
+                law: policy.law.clone(),
+                course: None,
+            }
         };
         policies.iter().map(begin).collect()
     }
 
     /// The futures of a round at its start. Imitation has no policy.
-    fn futures(&self, round: &Round<'_>, begun: &[(Proposal, IdmConfig)]) -> Vec<CandidateFuture> {
-        let future = |&candidate: &usize| {
-            let (policy, law) = begun.get(candidate).cloned().unwrap_or_default();
-            CandidateFuture {
-                forecast: self.state.forecast.clone(),
-                policy,
-                law,
-                drive: vec![*self.input.ego],
-                frames: Vec::new(),
-                lost: false,
-            }
-        };
+    fn futures(&self, round: &Round<'_>, begun: &[Begun]) -> Vec<CandidateFuture> {
+        let future =
+            |&candidate: &usize| self.future(begun.get(candidate).cloned().unwrap_or_default());
         let candidates = round.candidates.iter();
         let futures = candidates.flat_map(|c| (0..round.n_futures).map(move |_| future(c)));
         futures.collect()
+    }
+
+    /// A future at its start.
+    pub(super) fn future(&self, begun: Begun) -> CandidateFuture {
+        CandidateFuture {
+            forecast: self.state.forecast.clone(),
+            policy: begun.policy,
+            law: begun.law,
+            course: begun.course,
+            drive: vec![*self.input.ego],
+            frames: Vec::new(),
+            lost: false,
+        }
     }
 
     /// Lets every policy drive for half a second among the other agents as known so far.
@@ -348,18 +417,24 @@ impl<'a> Imagination<'a> {
                     coast(&mut future.drive);
                     return;
                 }
-                let proposer = Proposer {
-                    forecast: &future.forecast,
-                    law: &future.law,
-                    ..*proposer
-                };
-                let corridor = &corridors[future.policy.line];
-                let policy = std::slice::from_mut(&mut future.policy);
-                proposer.drive_within(corridor, policy, k + 1..=k + LOOK);
-                let reference = &future.policy.poses[k..];
-                tracker.drive(&future.drive[k], reference, wheel_base, states);
-                future.drive.extend_from_slice(&states[1..=DECISION]);
-                future.policy.truncate(k + DECISION);
+                if let Some(course) = &future.course {
+                    future
+                        .drive
+                        .extend_from_slice(&course[k + 1..=k + DECISION]);
+                } else {
+                    let proposer = Proposer {
+                        forecast: &future.forecast,
+                        law: &future.law,
+                        ..*proposer
+                    };
+                    let corridor = &corridors[future.policy.line];
+                    let policy = std::slice::from_mut(&mut future.policy);
+                    proposer.drive_within(corridor, policy, k + 1..=k + LOOK);
+                    let reference = &future.policy.poses[k..];
+                    tracker.drive(&future.drive[k], reference, wheel_base, states);
+                    future.drive.extend_from_slice(&states[1..=DECISION]);
+                    future.policy.truncate(k + DECISION);
+                }
                 let judge = Judge {
                     forecast: &future.forecast,
                     ..judge
@@ -370,7 +445,7 @@ impl<'a> Imagination<'a> {
 
     /// Steps the world through the half second that was just driven, in the futures that are still
     /// simulated.
-    fn answer(
+    pub(super) fn answer(
         &self,
         session: &mut (dyn Session + '_),
         futures: &mut [CandidateFuture],
@@ -422,7 +497,7 @@ impl<'a> Imagination<'a> {
     }
 
     /// Lets the vehicle follow the world's motion of the ego.
-    fn imitate(&self, futures: &mut [CandidateFuture], n_decisions: usize) {
+    pub(super) fn imitate(&self, futures: &mut [CandidateFuture], n_decisions: usize) {
         let (scene, vehicle) = (self.input.scene, &self.state.vehicle);
         let now = scene.ego_now().state;
         let mut tracker = Tracker::new(n_decisions * DECISION);
@@ -466,7 +541,7 @@ impl<'a> Imagination<'a> {
         }
     }
 
-    fn failed(&self, source: BoxError) -> PlanError {
+    pub(super) fn failed(&self, source: BoxError) -> PlanError {
         PlanError::World {
             world: self.world.name().to_owned(),
             source,
@@ -513,7 +588,7 @@ fn coast(drive: &mut Vec<EgoState>) {
 }
 
 /// Frames of a session in half a second.
-fn frames_per_decision(session: &(dyn Session + '_)) -> Result<usize, RolloutError> {
+pub(super) fn frames_per_decision(session: &(dyn Session + '_)) -> Result<usize, RolloutError> {
     let ratio = DECISION_S / session.dt();
     let per = ratio.round();
     let divides = per >= 1.0 && DECISION.is_multiple_of(per as usize);

@@ -2,7 +2,8 @@
 //! simulated agents, and the one with the best value over several futures is followed.
 //!
 //! Start with [`InteractiveDriver`]. `imagine` simulates policies and world in turns, `choice`
-//! computes values and chooses. Lines, tracker, road and score are those of [`crate::PdmClosed`],
+//! computes values and chooses; `modes` draws drives of the world's own ego, `warm_start` says which
+//! candidates need not be simulated again. Lines, tracker, road and score are those of [`crate::PdmClosed`],
 //! so the two planners differ only in their predictions of other agents.
 //!
 //! Source: the planner of the GUMP paper, which was never released; details that the paper leaves
@@ -10,9 +11,15 @@
 
 mod choice;
 mod imagine;
+mod modes;
+#[cfg(test)]
+mod modes_tests;
 mod policies;
 #[cfg(test)]
 mod tests;
+mod warm_start;
+#[cfg(test)]
+mod warm_start_tests;
 
 use std::fmt;
 use std::str::FromStr;
@@ -35,6 +42,8 @@ use crate::{PdmConfig, PlanError, ProposalKind};
 pub use choice::CandidateScore;
 use choice::{choose, is_emergency};
 use imagine::Imagination;
+use modes::Following;
+pub use warm_start::WarmStart;
 
 /// Settings of candidates, rollouts and values.
 #[derive(Clone, Debug, PartialEq)]
@@ -48,10 +57,16 @@ pub struct InteractiveDriverConfig {
     pub lane_changes: bool,
     /// Whether the world's own ego is a candidate as well.
     pub imitation: bool,
+    /// From 2 on, up to so many drives of the world's own ego are candidates as well, beside
+    /// imitation. Each is a single drive, drawn once and the same in all futures of the others;
+    /// draws that are alike count once. With 0 or 1 there are none: imitation has one draw.
+    pub network_modes: usize,
     /// Futures per candidate, > 0; fewer for candidates that drop out.
     pub n_futures: usize,
     /// Distribution of the rollouts over candidates.
     pub allocation: Allocation,
+    /// What the last decision spares this one; no effect with [`Allocation::Uniform`].
+    pub warm_start: WarmStart,
     /// The seed: future *k* of every candidate has the same random numbers.
     pub seed: Seed,
     /// Iterations of the loop between two decisions, > 0; in between the chosen policy is followed.
@@ -84,8 +99,10 @@ impl Default for InteractiveDriverConfig {
             driving_styles: true,
             lane_changes: true,
             imitation: true,
+            network_modes: 0,
             n_futures: 4,
             allocation: Allocation::default(),
+            warm_start: WarmStart::default(),
             seed: Seed(0),
             replan_every: 5,
             value: ValueEstimate::Rollout,
@@ -240,13 +257,17 @@ pub struct CandidateEvaluation {
     /// The result of each future.
     pub score: CandidateScore,
     /// The value by which it is chosen: [`InteractiveDriverConfig::aggregate`] of its futures, and
-    /// the [`hedge`](InteractiveDriverConfig::hedge), less a small cost of changing lane.
+    /// the [`hedge`](InteractiveDriverConfig::hedge), less a small cost of changing lane. Of one that
+    /// rests, the value in the decision that simulated it last.
     pub value: f64,
     /// The score among agents that keep their velocity; `None` where it has no weight.
     pub hedge: Option<Score>,
     /// Whether it was simulated to the end and could be chosen: [`Allocation::Halving`] drops
     /// others on the way.
     pub finalist: bool,
+    /// Number of decisions in a row, this one included, that did not simulate it in the world
+    /// ([`WarmStart::Rest`]). Above 0 its only future is the one in which others keep their velocity.
+    pub rests: usize,
     /// Number of futures with a collision at the ego's fault.
     pub collisions: usize,
     /// Mean progress along the way, metres.
@@ -278,7 +299,8 @@ pub struct Decision {
     pub chosen: usize,
     /// True if the ego brakes instead, because even the best candidate collides soon.
     pub brakes: bool,
-    /// All candidates: lateral offsets one after another, within each the speeds, imitation last.
+    /// All candidates: lateral offsets one after another, within each the speeds; other driving
+    /// styles, changes of lane, the network's modes, imitation last.
     pub candidates: Vec<CandidateEvaluation>,
     /// Horizon that was simulated, seconds.
     pub horizon: f64,
@@ -305,8 +327,10 @@ pub struct InteractiveDriver<'w> {
     state: Option<State>,
     decision: Option<Decision>,
     decided_at: usize,
-    /// The path of the chosen imitation.
-    following: Option<Trajectory>,
+    /// Number of decisions of this drive.
+    n_decisions: usize,
+    /// The path of the chosen imitation or mode.
+    following: Option<Following>,
 }
 
 impl<'w> InteractiveDriver<'w> {
@@ -326,6 +350,7 @@ impl<'w> InteractiveDriver<'w> {
             state: None,
             decision: None,
             decided_at: 0,
+            n_decisions: 0,
             following: None,
         })
     }
@@ -341,7 +366,7 @@ impl<'w> InteractiveDriver<'w> {
 
     fn is_due(&self, input: &PlannerInput<'_>) -> bool {
         let old = input.iteration >= self.decided_at + self.config.replan_every;
-        let ends = |way: &Trajectory| way.end_us() < input.ego.time_us + 2_000_000;
+        let ends = |f: &Following| f.way.end_us() < input.ego.time_us + 2_000_000;
         old || self.decision.is_none() || self.following.as_ref().is_some_and(ends)
     }
 
@@ -354,22 +379,41 @@ impl<'w> InteractiveDriver<'w> {
             speeds,
             input,
             clock: &*self.clock,
+            last: self.decision.as_ref(),
+            n_decisions: self.n_decisions,
+            following: self.following.as_ref(),
         };
         let mut decision = imagination.imagine()?;
         // Changes of lane come and go: the previous choice is found by its kind.
         let kind = |decision: &Decision| decision.candidates[decision.chosen].kind;
         let kind = self.decision.as_ref().map(kind);
+        let under_way = self.following.as_ref().and_then(|following| {
+            following.mode_under_way(input.ego.time_us, self.config.budget.horizon)
+        });
+        // A new mode with an old number is another drive.
+        let kind = kind.filter(|kind| match kind {
+            ProposalKind::NetworkMode { index } => under_way == Some(*index),
+            _ => true,
+        });
         let same = |evaluation: &CandidateEvaluation| Some(evaluation.kind) == kind;
         let previous = decision.candidates.iter().position(same);
         decision.chosen = choose(&decision.candidates, previous, self.config.hysteresis);
         let chosen = &decision.candidates[decision.chosen];
         decision.brakes = is_emergency(chosen, input.ego);
-        self.following = match chosen.kind {
-            ProposalKind::Imitation if !decision.brakes => Some(imitated(chosen, input.ego)?),
-            _ => None,
+        let goes_on = match chosen.kind {
+            ProposalKind::NetworkMode { index } => under_way == Some(index),
+            _ => false,
         };
+        if decision.brakes {
+            self.following = None;
+        } else if !goes_on {
+            // A mode that goes on is followed as it was drawn, not as the vehicle would follow it
+            // from here: deviations do not add up.
+            self.following = Following::begin(chosen, input.ego, decision.horizon)?;
+        }
         self.decision = Some(decision);
         self.decided_at = input.iteration;
+        self.n_decisions += 1;
         Ok(())
     }
 
@@ -381,8 +425,8 @@ impl<'w> InteractiveDriver<'w> {
         if decision.brakes {
             return Ok(trajectory(ego.time_us, &brake(ego, &state.vehicle))?);
         }
-        if let Some(way) = &self.following {
-            return Ok(way.clone());
+        if let Some(following) = &self.following {
+            return Ok(following.way.clone());
         }
         let policies = policies::all(&self.config, speeds, state.lane_changes());
         let chosen = &policies[decision.chosen];
@@ -402,6 +446,7 @@ impl Driver for InteractiveDriver<'_> {
     fn start(&mut self, initialization: &PlannerInitialization<'_>) -> Result<(), BoxError> {
         self.state = Some(State::new(initialization)?);
         (self.decision, self.following) = (None, None);
+        self.n_decisions = 0;
         Ok(())
     }
 
@@ -449,34 +494,6 @@ impl Explain for InteractiveDriver<'_> {
     fn decision(&self) -> Option<&Decision> {
         self.decision.as_ref()
     }
-}
-
-/// The ego's motion in the future that ends nearest to the mean end of all, and straight on after
-/// it.
-fn imitated(evaluation: &CandidateEvaluation, ego: &EgoState) -> Result<Trajectory, PlanError> {
-    let end = |drive: &Vec<EgoState>| drive[drive.len() - 1].rear_axle.position;
-    let n = evaluation.drives.len() as f64;
-    let middle = evaluation
-        .drives
-        .iter()
-        .map(end)
-        .sum::<gump_geometry::DVec2>()
-        / n;
-    let off = |drive: &Vec<EgoState>| end(drive).distance_squared(middle);
-    let nearest = evaluation
-        .drives
-        .iter()
-        .min_by(|a, b| off(a).total_cmp(&off(b)));
-    let drive = nearest.expect("there is at least one future");
-    let mut poses: Vec<_> = drive.iter().map(|state| state.rear_axle).collect();
-    let last = drive[drive.len() - 1];
-    let step = last.rear_axle.direction() * (last.velocity.x.max(0.0) * DT);
-    for i in 1..=TRAJECTORY_STEPS - (poses.len() - 1) {
-        let mut pose = last.rear_axle;
-        pose.position += step * i as f64;
-        poses.push(pose);
-    }
-    Ok(trajectory(ego.time_us, &poses)?)
 }
 
 /// Steps of a tenth of a second within the horizon.

@@ -20,7 +20,7 @@ const STREET: &str = "
     route 1
 ";
 
-fn recording(text: &str) -> Recording {
+pub(super) fn recording(text: &str) -> Recording {
     let mut scenario = fixture::scenario(&format!("{STREET}{text}")).unwrap();
     derive_roadblocks(&mut scenario);
     Recording::of_boxes(scenario).unwrap()
@@ -33,7 +33,7 @@ fn decide(world: &dyn WorldModel, config: InteractiveDriverConfig, text: &str) -
 }
 
 /// Some speeds on some lines, no imitation.
-fn only(speeds: &[f64], offsets: &[f64]) -> InteractiveDriverConfig {
+pub(super) fn only(speeds: &[f64], offsets: &[f64]) -> InteractiveDriverConfig {
     InteractiveDriverConfig {
         proposals: PdmConfig {
             speed_fractions: speeds.to_vec(),
@@ -59,10 +59,10 @@ fn fraction(evaluation: &CandidateEvaluation) -> f64 {
 
 /// State of an agent other than the ego in half a second, from the agent now, the ego with its next
 /// state, and a seed.
-type Law = fn(&Agent, &Agent, Seed) -> AgentState;
+pub(super) type Law = fn(&Agent, &Agent, Seed) -> AgentState;
 
 /// A world by a law, at 2 Hz; the ego goes straight on if it is not driven.
-struct ByLaw(Law);
+pub(super) struct ByLaw(pub(super) Law);
 
 struct Futures {
     law: Law,
@@ -113,7 +113,7 @@ impl Session for Futures {
     }
 }
 
-fn coasted(agent: &Agent) -> AgentState {
+pub(super) fn coasted(agent: &Agent) -> AgentState {
     let mut state = agent.state;
     state.pose.position += state.velocity * 0.5;
     state
@@ -131,7 +131,7 @@ fn yields_to_the_bold(agent: &Agent, ego: &Agent, _: Seed) -> AgentState {
 }
 
 /// Keeps its direction at a speed drawn once per future.
-fn at_random_speed(agent: &Agent, _: &Agent, seed: Seed) -> AgentState {
+pub(super) fn at_random_speed(agent: &Agent, _: &Agent, seed: Seed) -> AgentState {
     let factor = (seed.0 % 2000) as f64 / 1000.0;
     let mut state = agent.state;
     state.pose.position += agent.state.pose.direction() * (6.0 * factor * 0.5);
@@ -253,7 +253,7 @@ fn fraction_and_offset(decision: &Decision) -> (f64, f64) {
 }
 
 /// All fifteen policies, no imitation.
-fn ruled() -> InteractiveDriverConfig {
+pub(super) fn ruled() -> InteractiveDriverConfig {
     InteractiveDriverConfig {
         imitation: false,
         driving_styles: false,
@@ -263,7 +263,7 @@ fn ruled() -> InteractiveDriverConfig {
     }
 }
 
-const FREE: &str = "ego vehicle 0: 10,0 velocity 10,0";
+pub(super) const FREE: &str = "ego vehicle 0: 10,0 velocity 10,0";
 
 #[test]
 fn a_free_road_is_driven_fast_and_in_the_middle() {
@@ -380,8 +380,8 @@ fn the_emergency_brake_is_the_last_resort() {
 }
 
 /// A vehicle at the side pulls out in front of the ego; the rest is constant velocity.
-struct PullsOut {
-    starts: Mutex<Vec<(usize, Seed)>>,
+pub(super) struct PullsOut {
+    pub(super) starts: Mutex<Vec<(usize, Seed)>>,
 }
 
 struct PullingOut<'a>(Box<dyn Session + 'a>);
@@ -557,7 +557,7 @@ fn threads_change_nothing() {
 }
 
 /// A vehicle ahead whose speed differs from future to future.
-const BEHIND: &str = "ego vehicle 0: 2,0 velocity 6,0
+pub(super) const BEHIND: &str = "ego vehicle 0: 2,0 velocity 6,0
     agent vehicle 1: 25,0 velocity 5,0";
 
 #[test]
