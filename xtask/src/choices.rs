@@ -12,7 +12,7 @@ use gump_data::OutputFormat;
 use gump_engine::{CacheMode, LightSource, Mode, Precision};
 use gump_generate::Placement;
 use gump_nuplan::closed_loop::Tracking;
-use gump_planner::{Aggregate, Allocation};
+use gump_planner::{Aggregate, Allocation, WarmStart};
 use gump_rl::Algorithm;
 use gump_wosac::motion::ShapeRules;
 use gump_wosac::realism::Year;
@@ -56,6 +56,15 @@ pub(crate) const ALLOCATIONS: [(Allocation, &str); 2] = [
     (
         Allocation::Halving,
         "One future of all candidates, further ones of the better half, and so on",
+    ),
+];
+
+/// What a decision takes over from the one before it.
+pub(crate) const WARM_STARTS: [(WarmStart, &str); 2] = [
+    (WarmStart::Off, "Nothing: all candidates are simulated"),
+    (
+        WarmStart::Rest,
+        "Policies that were clearly worse rest for up to three decisions, unless they could win now",
     ),
 ];
 
@@ -170,6 +179,7 @@ mod tests {
         check(&PRECISIONS, &Precision::ALL);
         check(&LIGHTS, &LightSource::ALL);
         check(&ALLOCATIONS, &Allocation::ALL);
+        check(&WARM_STARTS, &WarmStart::ALL);
         check(&AGGREGATES, &Aggregate::ALL);
         check(&CONTROLLERS, &[Tracking::TwoStage, Tracking::Perfect]);
         check(&SHAPES, &ShapeRules::ALL);

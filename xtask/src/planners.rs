@@ -9,10 +9,10 @@ use clap::builder::{PossibleValue, TypedValueParser};
 use clap::{Arg, Command};
 use gump_engine::SamplingConfig;
 use gump_eval::planners::{PlannerConfig, PlannerName};
-use gump_planner::{Aggregate, Allocation};
+use gump_planner::{Aggregate, Allocation, WarmStart};
 use serde::{Serialize, Serializer};
 
-use crate::choices::{AGGREGATES, ALLOCATIONS, named, one_of};
+use crate::choices::{AGGREGATES, ALLOCATIONS, WARM_STARTS, named, one_of};
 use crate::cli::WrongArguments;
 
 /// Our planners as the help lists them.
@@ -150,6 +150,12 @@ pub(crate) struct ImaginationArgs {
     /// Allocation of futures to the interactive planner's candidates
     #[arg(long, value_parser = one_of(ALLOCATIONS), default_value_t = Allocation::Halving)]
     allocation: Allocation,
+    /// What a decision of the interactive planner takes over from the last one
+    #[arg(long, value_parser = one_of(WARM_STARTS), default_value_t = PlannerConfig::default().warm_start)]
+    warm_start: WarmStart,
+    /// Drives of the network's own ego among the interactive planner's candidates, from 2 on
+    #[arg(long, value_name = "N", default_value_t = PlannerConfig::default().network_modes)]
+    network_modes: usize,
     /// Aggregation of a candidate's scores over its futures
     #[arg(long, value_parser = one_of(AGGREGATES), default_value_t = Aggregate::Mean)]
     aggregate: Aggregate,
@@ -218,6 +224,8 @@ impl ImaginationArgs {
         Ok(PlannerConfig {
             futures: self.futures,
             allocation: self.allocation,
+            warm_start: self.warm_start,
+            network_modes: self.network_modes,
             aggregate: self.aggregate,
             hedge: self.hedge,
             hysteresis: self.hysteresis,

@@ -82,9 +82,11 @@ const DECODING: [&str; 12] = [
 const TRAFFIC: [&str; 2] = ["life", "lights"];
 
 /// Flags of the interactive planner's simulations and choices.
-const THINKING: [&str; 11] = [
+const THINKING: [&str; 13] = [
     "futures",
     "allocation",
+    "warm_start",
+    "network_modes",
     "aggregate",
     "hedge",
     "hysteresis",

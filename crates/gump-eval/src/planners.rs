@@ -18,7 +18,7 @@ use gump_nuplan::reactive_agents::NuplanIdm;
 use gump_nuplan::tracking::Trajectory;
 use gump_planner::{
     Aggregate, Allocation, Explain, ImitationDriver, InteractiveDriver, InteractiveDriverConfig,
-    LogDriver, NuplanIdmDriver, PdmClosed, PlanBudget, SimpleDriver, ValueEstimate,
+    LogDriver, NuplanIdmDriver, PdmClosed, PlanBudget, SimpleDriver, ValueEstimate, WarmStart,
 };
 use gump_rollout::worlds::Idm;
 use gump_rollout::{BoxError, WorldModel};
@@ -149,6 +149,11 @@ pub struct PlannerConfig {
     pub futures: usize,
     /// Distribution of rollouts over the candidates of the interactive planner.
     pub allocation: Allocation,
+    /// What the last decision of the interactive planner spares the next one.
+    pub warm_start: WarmStart,
+    /// Fixed drives of the world's own ego among the candidates of the interactive planner, from 2
+    /// on; with 0 or 1 there are none.
+    pub network_modes: usize,
     /// Aggregation of the values of a candidate's futures into one.
     pub aggregate: Aggregate,
     /// Weight of a future in which other agents keep their velocity, 0 to 1.
@@ -174,6 +179,8 @@ impl Default for PlannerConfig {
         Self {
             futures: 4,
             allocation: Allocation::default(),
+            warm_start: WarmStart::default(),
+            network_modes: InteractiveDriverConfig::default().network_modes,
             aggregate: Aggregate::default(),
             hedge: InteractiveDriverConfig::default().hedge,
             hysteresis: 0.0,
@@ -199,6 +206,8 @@ impl PlannerConfig {
         let config = InteractiveDriverConfig {
             n_futures: self.futures,
             allocation: self.allocation,
+            warm_start: self.warm_start,
+            network_modes: self.network_modes,
             aggregate: self.aggregate,
             hedge: self.hedge,
             hysteresis: self.hysteresis,

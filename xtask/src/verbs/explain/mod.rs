@@ -53,12 +53,19 @@ impl Explained<'_> {
         let rejected = reasons::best_rejected(decision);
         page.lede(format!(
             "{:.1} s after the start, {} candidates drove {:.1} s among others who react: the best {} \
-             of them in {} futures, the others in fewer. {}",
+             of them in {} futures, the others in fewer.{} {}",
             self.time,
-            decision.candidates.len(),
+            decision.candidates.iter().filter(|p| p.rests == 0).count(),
             decision.horizon,
             decision.candidates.iter().filter(|p| p.finalist).count(),
             chosen.futures.len(),
+            match decision.candidates.iter().filter(|p| p.rests > 0).count() {
+                0 => String::new(),
+                n => format!(
+                    " {n} more rest, because they were clearly worse before and are among others who \
+                     keep their velocity."
+                ),
+            },
             match decision.brakes {
                 true => "Even the best of them hits something soon: the ego brakes.".to_owned(),
                 false => format!("The ego drives \"{}\".", chosen.kind),
@@ -179,7 +186,10 @@ fn scores(page: &mut Page, decision: &Decision, order: &[usize]) {
             let mut row = vec![
                 evaluation.kind.to_string(),
                 format!("{:.3}", evaluation.value),
-                evaluation.futures.len().to_string(),
+                match evaluation.rests {
+                    0 => evaluation.futures.len().to_string(),
+                    _ => "rests".to_owned(),
+                },
             ];
             row.extend(telling.iter().map(|&part| format!("{:.2}", value(i, part))));
             row.push(format!("{:.1}", evaluation.progress_m));
