@@ -16,6 +16,7 @@ mod attention;
 mod batch_norm;
 mod conv;
 mod deferred;
+mod divergence;
 mod edge_attention;
 mod gelu;
 mod gru;
@@ -30,6 +31,7 @@ pub use attention::{
 };
 pub use batch_norm::batch_norm;
 pub use conv::conv2d;
+pub use divergence::{weighted_divergence, weighted_entropy};
 pub use edge_attention::edge_attention;
 pub use gelu::gelu;
 pub use gru::gru;
