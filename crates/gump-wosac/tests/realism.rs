@@ -122,7 +122,21 @@ fn the_largest_penalty_names_agent_and_step() {
             future[0].x[k] = future[1].x[k] - 3.0;
         }
     }
+    // In the last one a step later.
+    crash.futures[31][0].x[20] = rollouts(&[1.0]).futures[0][0].x[20];
     let evaluation = reference.evaluate(&crash).unwrap();
+    let first = evaluation.first_indications(Component::Collision);
+    assert_eq!(first[..31], vec![vec![Some(20); 2]; 31]);
+    assert_eq!(first[31], [Some(21); 2]);
+    let (_, ever) = evaluation.indications(Component::Offroad);
+    for (first, ever) in evaluation
+        .first_indications(Component::Offroad)
+        .iter()
+        .zip(ever)
+    {
+        assert_eq!(first.iter().map(Option::is_some).collect::<Vec<_>>(), ever);
+    }
+    assert!(evaluation.first_indications(Component::LinearSpeed)[0].is_empty());
     let attributions = evaluation.explain();
     assert!(
         attributions

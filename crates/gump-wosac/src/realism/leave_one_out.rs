@@ -8,9 +8,7 @@ use std::collections::BTreeMap;
 
 use gump_scene::AgentId;
 
-use super::config::Component;
 use super::estimate::leave_one_out;
-use super::features::Features;
 use super::reference::{Evaluation, geometric_mean};
 use super::scores::{Scores, rounded};
 
@@ -63,16 +61,18 @@ impl Evaluation<'_> {
             let counted = mask.map_or(with.len(), |m| m.iter().filter(|&&m| m).count());
             let likelihood = geometric_mean(with, mask);
             let share = f64::from(feature.weight) * likelihood / counted.max(1) as f64;
+            let held = component.is_indication();
+            let held = held.then(|| self.first_indications(component));
             for (i, without) in without.iter().enumerate() {
-                let held = (component.is_indication())
-                    .then(|| self.first_held(&self.imagined[i], component));
+                let held = held.as_ref().map(|held| &held[i]);
                 components[i].insert(component, rounded(geometric_mean(without, mask)));
                 let gains = with.iter().zip(without).enumerate();
                 for (at, (with, without)) in gains {
                     if mask.is_some_and(|mask| !mask[at]) {
                         continue;
                     }
-                    let place = held.as_ref().map_or(at, |held| at * n_steps + held[at]);
+                    let last = n_steps - 1;
+                    let place = held.map_or(at, |held| at * n_steps + held[at].unwrap_or(last));
                     credit[i][place] += share * f64::from(with - without);
                 }
             }
@@ -87,16 +87,5 @@ impl Evaluation<'_> {
             n_steps,
             credit,
         })
-    }
-
-    /// The step at which an indicator first holds, by agent; the last if it never does.
-    fn first_held(&self, features: &Features, component: Component) -> Vec<usize> {
-        let vehicles_only = component == Component::TrafficLightViolation;
-        let holds = self.reference.indicated(features, component, vehicles_only);
-        let last = features.n_steps - 1;
-        let agents = holds.chunks(features.n_steps);
-        agents
-            .map(|own| own.iter().position(|&holds| holds).unwrap_or(last))
-            .collect()
     }
 }

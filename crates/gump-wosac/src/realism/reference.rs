@@ -305,6 +305,20 @@ impl<'a> Evaluation<'a> {
         let imagined = self.imagined.iter().map(ever).collect();
         (ever(self.reference.features()), imagined)
     }
+
+    /// The scored step, from 0, at which an indicator first holds for each scored agent, in each
+    /// rollout (of equal ones only one); `None` where it never does. Empty for other components.
+    pub fn first_indications(&self, component: Component) -> Vec<Vec<Option<usize>>> {
+        let vehicles_only = component == Component::TrafficLightViolation;
+        let first = |features: &Features| {
+            let holds = self.reference.indicated(features, component, vehicles_only);
+            let agents = holds.chunks(features.n_steps);
+            agents
+                .map(|own| own.iter().position(|&holds| holds))
+                .collect()
+        };
+        self.imagined.iter().map(first).collect()
+    }
 }
 
 /// Exponential of the mean of the values that count; NaN if none does.
