@@ -26,7 +26,19 @@ struct Row {
     tokens: usize,
     /// Realism of the rollouts that were learned from.
     rollouts: Option<f64>,
+    rewarded: Rewarded,
     validation: Option<Validation>,
+}
+
+/// Means over the rewarded moves of a step, if there were any.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+struct Rewarded {
+    /// Nats a move.
+    entropy: Option<f64>,
+    /// Divergence from the network at the start, nats a move.
+    kl: Option<f64>,
+    /// Weight of the divergence in the loss.
+    kl_weight: Option<f64>,
 }
 
 /// Validation after a step.
@@ -46,7 +58,12 @@ pub(crate) struct Losses {
 }
 
 const HEADER: &str = "step,total,state,control,trajectory,reconstruction,learning_rate,\
-                      gradient_norm,tokens,rollouts,validation,realism,min_ade";
+                      gradient_norm,tokens,rollouts,entropy,kl,kl_weight,validation,realism,\
+                      min_ade";
+
+/// Number of cells of files from before there were those of `Rewarded`, and where these are now.
+const FORMER_CELLS: usize = 13;
+const REWARDED: usize = 10;
 
 impl Losses {
     /// Reads the rows up to `steps` of an earlier part of the run.
@@ -79,6 +96,11 @@ impl Losses {
             gradient_norm: report.gradient_norm,
             tokens: report.tokens,
             rollouts: report.rollouts,
+            rewarded: Rewarded {
+                entropy: report.entropy,
+                kl: report.kl,
+                kl_weight: report.kl_weight,
+            },
             validation: None,
         });
         self.last = Some(report);
@@ -163,31 +185,45 @@ impl Losses {
     /// where nothing was imagined.
     pub(crate) fn realism_chart(&self) -> Option<Chart> {
         let held_out = self.validations(|validation| Some(validation.imagined?.0));
-        let chunk = self.rows.len().div_ceil(DRAWN).max(20);
-        let learned = self.rows.chunks(chunk).filter_map(|rows| {
-            let scores: Vec<f64> = rows.iter().filter_map(|row| row.rollouts).collect();
-            let mean = scores.iter().sum::<f64>() / scores.len() as f64;
-            (!scores.is_empty()).then(|| (rows[rows.len() / 2].step as f64, mean))
-        });
-        let curves = [
+        let series = named([
             ("held-out scenes", held_out),
-            ("rollouts learned from", learned.collect()),
-        ];
-        let series: Vec<Series> = curves
-            .into_iter()
-            .filter(|(_, points)| !points.is_empty())
-            .map(|(name, points)| Series {
-                name: name.into(),
-                points,
-                ..Series::default()
-            })
-            .collect();
+            ("rollouts learned from", self.measured(|row| row.rollouts)),
+        ]);
         (!series.is_empty()).then(|| Chart {
             x_label: "step".into(),
             y_label: "realism (2025)".into(),
             series,
             ..Chart::default()
         })
+    }
+
+    /// What rewards do to the network over the run, on a logarithmic axis, where they differ by
+    /// orders of magnitude: entropy, divergence from the start and its weight; `None` without
+    /// rewards.
+    pub(crate) fn rewards_chart(&self) -> Option<Chart> {
+        let series = named([
+            ("entropy", self.measured(|row| row.rewarded.entropy)),
+            ("KL to the start", self.measured(|row| row.rewarded.kl)),
+            ("weight of KL", self.measured(|row| row.rewarded.kl_weight)),
+        ]);
+        (!series.is_empty()).then(|| Chart {
+            x_label: "step".into(),
+            y_label: "nats a move; weight".into(),
+            log_y: true,
+            series,
+            ..Chart::default()
+        })
+    }
+
+    /// A curve of means over the steps that have a number.
+    fn measured(&self, of: impl Fn(&Row) -> Option<f64>) -> Vec<(f64, f64)> {
+        let chunk = self.rows.len().div_ceil(DRAWN).max(20);
+        let points = self.rows.chunks(chunk).filter_map(|rows| {
+            let numbers: Vec<f64> = rows.iter().filter_map(&of).collect();
+            let mean = numbers.iter().sum::<f64>() / numbers.len() as f64;
+            (!numbers.is_empty()).then(|| (rows[rows.len() / 2].step as f64, mean))
+        });
+        points.collect()
     }
 
     fn validations(&self, of: impl Fn(&Validation) -> Option<f64>) -> Vec<(f64, f64)> {
@@ -214,7 +250,10 @@ impl Losses {
 
 impl Row {
     fn parse(line: &str) -> Option<Self> {
-        let cells: Vec<&str> = line.split(',').collect();
+        let mut cells: Vec<&str> = line.split(',').collect();
+        if cells.len() == FORMER_CELLS {
+            cells.splice(REWARDED..REWARDED, [""; 3]);
+        }
         let [
             step,
             total,
@@ -226,6 +265,9 @@ impl Row {
             norm,
             tokens,
             rollouts,
+            entropy,
+            kl,
+            kl_weight,
             validation,
             realism,
             min_ade,
@@ -243,9 +285,11 @@ impl Row {
             learning_rate: rate.parse().ok()?,
             gradient_norm: norm.parse().ok()?,
             tokens: tokens.parse().ok()?,
-            rollouts: match *rollouts {
-                "" => None,
-                realism => Some(realism.parse().ok()?),
+            rollouts: number(rollouts)?,
+            rewarded: Rewarded {
+                entropy: number(entropy)?,
+                kl: number(kl)?,
+                kl_weight: number(kl_weight)?,
             },
             validation: match (*validation, *realism, *min_ade) {
                 ("", "", "") => None,
@@ -272,6 +316,7 @@ impl Row {
             gradient_norm,
             tokens,
             rollouts,
+            rewarded,
             validation,
         } = self;
         let (realism, min_ade) = validation.and_then(|v| v.imagined).unzip();
@@ -279,10 +324,17 @@ impl Row {
         let validation = validation.map(|v| v.loss);
         let [rollouts, validation, realism, min_ade] =
             [*rollouts, validation, realism, min_ade].map(cell);
+        let Rewarded {
+            entropy,
+            kl,
+            kl_weight,
+        } = *rewarded;
+        let [entropy, kl, kl_weight] = [entropy, kl, kl_weight].map(cell);
         writeln!(
             text,
             "{step},{total},{state},{control},{trajectory},{reconstruction},{learning_rate},\
-             {gradient_norm},{tokens},{rollouts},{validation},{realism},{min_ade}"
+             {gradient_norm},{tokens},{rollouts},{entropy},{kl},{kl_weight},{validation},\
+             {realism},{min_ade}"
         )
         .expect("writing to a string cannot fail");
     }
@@ -294,6 +346,26 @@ pub(crate) fn field_names(n: usize) -> Vec<String> {
     let poses =
         (0..n.saturating_sub(4)).map(|i| format!("{}_{}", ["x", "y", "heading"][i % 3], i / 3));
     fixed.into_iter().chain(poses).take(n).collect()
+}
+
+/// The number of a cell, if it is not empty; `None` if it is not a number.
+fn number(cell: &str) -> Option<Option<f64>> {
+    match cell {
+        "" => Some(None),
+        number => number.parse().ok().map(Some),
+    }
+}
+
+/// The curves that have points.
+fn named<const N: usize>(curves: [(&str, Vec<(f64, f64)>); N]) -> Vec<Series> {
+    let curves = curves.into_iter();
+    let curves = curves.filter(|(_, points)| !points.is_empty());
+    let series = curves.map(|(name, points)| Series {
+        name: name.into(),
+        points,
+        ..Series::default()
+    });
+    series.collect()
 }
 
 fn mean<'a>(rows: impl Iterator<Item = &'a Row>) -> Option<f64> {
@@ -324,6 +396,9 @@ mod tests {
                 gradient_norm: 0.1,
                 tokens: 10,
                 rollouts: (step % 2 == 0).then_some(0.5),
+                entropy: (step % 2 == 0).then_some(4.5),
+                kl: (step % 2 == 0).then_some(0.25 * step as f64),
+                kl_weight: (step % 2 == 0).then_some(2.0),
             });
         }
         losses.push_validation(n, 0.25, None);
@@ -347,8 +422,28 @@ mod tests {
         assert_eq!(written.last_validation(), Some(0.25));
         assert_eq!(written.last_realism(), Some(IMAGINED.0));
         assert_eq!(written.realism_chart().unwrap().series[0].points.len(), 1);
+        let chart = written.rewards_chart().unwrap();
+        let names: Vec<&str> = chart.series.iter().map(|curve| &*curve.name).collect();
+        assert_eq!(names, ["entropy", "KL to the start", "weight of KL"]);
+        assert_eq!(chart.series[1].points, [(4.0, 1.0)]);
+        assert!(chart.to_svg().is_ok());
         let learned = Losses::read(&path, 1).unwrap();
-        assert!(learned.realism_chart().is_none());
+        assert!(learned.realism_chart().is_none() && learned.rewards_chart().is_none());
+    }
+
+    #[test]
+    fn files_from_before_the_cells_of_rewards_are_read() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("losses.csv");
+        let lines =
+            "header\n1,2,3,0,0,0,0.001,0.5,10,0.75,,,\n2,1,3,0,0,0,0.001,0.5,10,,0.5,0.8,2\n";
+        std::fs::write(&path, lines).unwrap();
+        let rows = Losses::read(&path, 2).unwrap().rows;
+        assert_eq!(
+            (rows[0].rollouts, rows[0].rewarded),
+            (Some(0.75), Rewarded::default())
+        );
+        assert_eq!(rows[1].validation.unwrap().imagined, Some((0.8, 2.0)));
     }
 
     #[test]

@@ -23,7 +23,7 @@ use crate::config::ModelConfig;
 use crate::local_context::n_numbers;
 use crate::network::Network;
 use crate::prefixes::PREFIXES;
-pub use crate::prefixes::{DRIVER, OPTIMIZER, TRAINED};
+pub use crate::prefixes::{DRIVER, OPTIMIZER, REFERENCE, TRAINED};
 
 /// Version of the layout of names and metadata.
 const FORMAT: &str = "gump-1";

@@ -53,6 +53,19 @@ pub enum TrainError {
         /// Optimiser step.
         step: usize,
     },
+    /// The network has moved further from that at the start of the run than it may.
+    #[error(
+        "the divergence from the network at the start of the run is {divergence:.4} nats a move at \
+         step {step}, above kl_bound {bound}; the last checkpoint is intact"
+    )]
+    TooFar {
+        /// Optimiser step.
+        step: usize,
+        /// Mean over the rewarded moves of the step, nats.
+        divergence: f64,
+        /// The bound of the configuration.
+        bound: f64,
+    },
     /// There is nothing to train on.
     #[error("no scenario offers {frames} consecutive frames at 2 Hz to train on")]
     NoData {

@@ -45,6 +45,12 @@ pub struct StepReport {
     pub tokens: usize,
     /// Realism of the rollouts used in the step, if any.
     pub rollouts: Option<f64>,
+    /// Mean entropy of the network on the rewarded moves, nats a move, if any.
+    pub entropy: Option<f64>,
+    /// Mean divergence from the network at the start of the run on the same moves, nats a move.
+    pub kl: Option<f64>,
+    /// Weight that it had in the loss.
+    pub kl_weight: Option<f64>,
 }
 
 /// The samples of a step.
@@ -243,6 +249,9 @@ impl Trainer {
             gradient_norm,
             tokens: found.tokens,
             rollouts: None,
+            entropy: None,
+            kl: None,
+            kl_weight: None,
         })
     }
 

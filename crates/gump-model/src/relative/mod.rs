@@ -7,8 +7,9 @@
 //! frame.
 //!
 //! `map` cuts the map into pieces, `graph` builds nodes and edges, `grid` has the bins of a move,
-//! `sample` the training samples, `net` the network, `weights` its parameters without a tensor
-//! library, `store` its files. Rollouts are in `gump-engine`, training is in `gump-train`.
+//! `sample` the training samples, `net` the network, `preference` its loss on moves that are
+//! rewarded, `weights` its parameters without a tensor library, `store` its files. Rollouts are in
+//! `gump-engine`, training is in `gump-train`.
 
 mod config;
 pub mod graph;
@@ -16,6 +17,8 @@ pub mod grid;
 pub mod map;
 #[cfg(feature = "tensors")]
 mod net;
+#[cfg(feature = "tensors")]
+mod preference;
 pub mod sample;
 #[cfg(feature = "tensors")]
 mod store;
@@ -24,6 +27,8 @@ mod weights;
 pub use self::config::RelativeConfig;
 #[cfg(feature = "tensors")]
 pub use self::net::RelativeNetwork;
+#[cfg(feature = "tensors")]
+pub use self::preference::{Anchor, Preference};
 pub use self::sample::SampleConfig as RelativeSampleConfig;
 #[cfg(feature = "tensors")]
 pub use self::store::{config, header, is_relative, load, save};

@@ -283,21 +283,9 @@ impl RelativeNetwork {
         self.cross_entropy(sample, &outputs, total, smoothing_bins, |weight| weight)
     }
 
-    /// As [`Self::loss`] with weights of either sign, without smoothing: moves of positive weight
-    /// become more likely, those of negative weight less likely.
-    pub fn preference(&self, sample: &Sample, total: f64) -> Result<(Tensor, [f64; FIELDS])> {
-        let outputs = self.forced(sample)?;
-        let part = |sign: f32| {
-            let weight = move |weight: f32| (sign * weight).max(0.0);
-            self.cross_entropy(sample, &outputs, total, 0.0, weight)
-        };
-        let ((liked, gains), (disliked, losses)) = (part(1.0)?, part(-1.0)?);
-        let sums = std::array::from_fn(|field| gains[field] - losses[field]);
-        Ok(((liked - disliked)?, sums))
-    }
-
-    /// The decoder's inputs for the fields of the moves; each field sees those before it.
-    fn forced(&self, sample: &Sample) -> Result<Tensor> {
+    /// The decoder's outputs for the fields of the moves, [FIELDS, K, C]; each field sees those before
+    /// it.
+    pub(super) fn forced(&self, sample: &Sample) -> Result<Tensor> {
         let device = self.parameters.device();
         let targets = &sample.targets;
         let nodes: Vec<u32> = targets.iter().map(|target| target.node).collect();
@@ -316,7 +304,7 @@ impl RelativeNetwork {
     }
 
     /// Cross-entropies of the moves, each with the weight that `weigh` computes.
-    fn cross_entropy(
+    pub(super) fn cross_entropy(
         &self,
         sample: &Sample,
         outputs: &Tensor,

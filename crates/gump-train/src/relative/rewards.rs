@@ -16,70 +16,12 @@ use gump_model::steps::{TOKEN_DT, stride_of};
 use gump_rollout::{SimulateConfig, Start, simulate};
 use gump_scene::{AgentId, Frame, Rollout, Scenario, Seed};
 use gump_wosac::realism::{Config, LeaveOneOut, Log, Mode, Reference, Rollouts, Year};
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
 use crate::TrainError;
+use crate::relative::advantages::{ByMove, advantages, faults};
+use crate::relative::settings::RelativeRewards;
 use crate::scenes::with_log;
-
-/// Returns are clipped to this many standard deviations, so that rare ones do not outweigh a batch.
-/// Chosen by hand.
-const MOST: f64 = 3.0;
-/// Differences of returns smaller than this are rounding and ignored, in units of the metametric.
-const LEAST: f64 = 1e-9;
-
-/// Settings of learning from rollouts.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct RelativeRewards {
-    /// Futures of a scene, at least 2: each is compared with the others.
-    pub rollouts: usize,
-    /// Maximum number of agents of a scene, those nearest to the ego.
-    pub agents: usize,
-    /// Weight of the rewarded moves relative to the moves of the batch, which keep the network near
-    /// the data.
-    pub weight: f64,
-    /// Steps after which the network that is rolled out is updated.
-    pub refresh: usize,
-}
-
-impl Default for RelativeRewards {
-    /// Chosen by hand (docs/decisions/0018-learning-from-realism.md).
-    fn default() -> Self {
-        Self {
-            rollouts: 8,
-            agents: 40,
-            weight: 0.5,
-            refresh: 10,
-        }
-    }
-}
-
-impl RelativeRewards {
-    /// Error: [`TrainError::Config`] naming the first number out of its range.
-    pub(super) fn validate(&self) -> Result<(), TrainError> {
-        let fail = |key: &'static str, what: &str| {
-            let reason = format!("realism: {what}");
-            Err(TrainError::Config { key, reason })
-        };
-        if self.rollouts < 2 {
-            return fail(
-                "realism.rollouts",
-                "rollouts must be at least 2, as each is compared with the others",
-            );
-        }
-        if self.agents == 0 || self.refresh == 0 {
-            let key = match self.agents {
-                0 => "realism.agents",
-                _ => "realism.refresh",
-            };
-            return fail(key, "agents and refresh must be at least 1");
-        }
-        if !self.weight.is_finite() || self.weight <= 0.0 {
-            return fail("realism.weight", "weight must be above 0");
-        }
-        Ok(())
-    }
-}
 
 /// Futures of one scene with the returns of their moves.
 pub(super) struct Group {
@@ -160,7 +102,11 @@ impl Judged {
             scenes: 0,
             agents: agents.count(),
         };
-        let samples = judged(&scenario, &futures, &worth);
+        let worth = &worth;
+        let per_move = (TOKEN_DT / scenario.dt).round() as usize;
+        let found = (realism, worth);
+        let earnings = advantages(&self.config, found, &faults(&evaluation), per_move);
+        let samples = earnings.and_then(|earned| judged(&scenario, &futures, worth, &earned));
         Ok(samples.map(|samples| Group {
             samples,
             realism,
@@ -195,15 +141,14 @@ fn nearest(scenario: &Scenario, most: usize) -> Scenario {
     }
 }
 
-/// Each future as a sample whose moves are weighted by their returns; `None` if all returns are
-/// equal.
-fn judged(scenario: &Scenario, futures: &[Rollout], worth: &LeaveOneOut) -> Option<Vec<Sample>> {
-    let per_move = (TOKEN_DT / scenario.dt).round() as usize;
-    let n_moves = worth.n_steps / per_move;
-    let earnings = standardized(&worth.credit, |credit| {
-        let agents = credit.chunks(worth.n_steps);
-        agents.flat_map(|own| to_go(own, per_move)).collect()
-    })?;
+/// Each future as a sample whose moves are weighted by their advantages.
+fn judged(
+    scenario: &Scenario,
+    futures: &[Rollout],
+    worth: &LeaveOneOut,
+    earnings: &ByMove,
+) -> Option<Vec<Sample>> {
+    let n_moves = earnings.first()?.len() / worth.agents.len();
     let stride = stride_of(scenario.dt);
     let (start, first_move) = (scenario.now % stride, scenario.now / stride);
     let now = &scenario.log[scenario.now];
@@ -212,7 +157,7 @@ fn judged(scenario: &Scenario, futures: &[Rollout], worth: &LeaveOneOut) -> Opti
     let scored: Vec<Option<usize>> = ids.iter().map(scored).collect();
     let centre = now.agent(scenario.ego)?.state.pose.position;
     let map = VectorMap::new(&scenario.map, centre, MAP_M, Hidden::default());
-    let samples = futures.iter().zip(&earnings).map(|(future, earned)| {
+    let samples = futures.iter().zip(earnings).map(|(future, earned)| {
         let mut log = scenario.log[..=scenario.now].to_vec();
         log.extend(future.imagined().iter().cloned());
         let driven = with_log(scenario, log);
@@ -224,40 +169,4 @@ fn judged(scenario: &Scenario, futures: &[Rollout], worth: &LeaveOneOut) -> Opti
         Some(sample)
     });
     samples.collect()
-}
-
-/// The return of each move, given the reward at each step.
-fn to_go(credit: &[f64], per_move: usize) -> Vec<f64> {
-    let mut earned: Vec<f64> = credit
-        .chunks_exact(per_move)
-        .map(|steps| steps.iter().sum())
-        .collect();
-    for k in (1..earned.len()).rev() {
-        earned[k - 1] += earned[k];
-    }
-    earned
-}
-
-/// The advantage of each future: its return minus the mean of all, in standard deviations of the
-/// group; `None` if the differences are negligible.
-fn standardized(credit: &[Vec<f64>], earned: impl Fn(&[f64]) -> Vec<f64>) -> Option<Vec<Vec<f64>>> {
-    let mut all: Vec<Vec<f64>> = credit.iter().map(|credit| earned(credit)).collect();
-    let n = all.len() as f64;
-    let n_moves = all.first()?.len();
-    let mut squares = 0.0;
-    for at in 0..n_moves {
-        let mean = all.iter().map(|earned| earned[at]).sum::<f64>() / n;
-        for earned in &mut all {
-            earned[at] -= mean;
-            squares += earned[at] * earned[at];
-        }
-    }
-    let spread = (squares / (n * n_moves as f64)).sqrt();
-    if spread.is_nan() || spread <= LEAST {
-        return None;
-    }
-    for earned in all.iter_mut().flatten() {
-        *earned = (*earned / spread).clamp(-MOST, MOST);
-    }
-    Some(all)
 }

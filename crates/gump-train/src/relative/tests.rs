@@ -16,6 +16,8 @@ use super::*;
 use crate::gradients::Gradients;
 use crate::learner::Update;
 
+mod reinforced;
+
 fn config() -> RelativeConfig {
     RelativeConfig {
         width: 32,

@@ -3,7 +3,6 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::mpsc::{Receiver, channel};
 
 use candle_core::backprop::GradStore;
 use candle_core::{Device, Tensor};
@@ -13,24 +12,23 @@ use gump_model::checkpoint::StorageType;
 use gump_model::relative::grid::FIELDS;
 use gump_model::relative::sample::{Sample, SampleConfig, draw};
 use gump_model::relative::{RelativeConfig, RelativeNetwork};
+use gump_nn::NnError;
 use gump_nn::ops::Deferred;
 use gump_nn::optimizer::{AdamW, OptimizerConfig};
 use gump_nn::parameters::Parameters;
-use gump_nn::{Gradients, NnError};
 use gump_scene::{Scenario, Seed};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
+use crate::gradients::Gradients;
 use crate::learner::Update;
-use crate::relative::drives::{NetworkDriver, RelativeDrives};
-use crate::relative::rewards::{Group, Judged, RelativeRewards, RewardExclusions};
+use crate::relative::batches::{Batch, BatchReceiver, BatchSource, Drivers, prefetch};
+use crate::relative::divergence::Tether;
+use crate::relative::drives::RelativeDrives;
+use crate::relative::rewards::RewardExclusions;
+use crate::relative::settings::RelativeRewards;
 use crate::scenes::{DATA, ScenarioSource, check_data};
-
-/// Maximum number of scenes tried for a sample: more mean that hardly any is long enough.
-const ATTEMPTS: u64 = 64;
-/// Separates the scenes to roll out from those of the samples.
-const GROUP: u64 = 1 << 40;
 
 /// Training settings.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -129,104 +127,37 @@ pub struct RelativeStep {
     /// Realism of the rollouts used in the step, if any.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rollouts: Option<f64>,
+    /// Mean entropy of the network before the step on the rewarded moves, nats a move, if any.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub entropy: Option<f64>,
+    /// Mean divergence from the network at the start of the run on the same moves, nats a move, with
+    /// [`RelativeRewards::kl_target`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub kl: Option<f64>,
+    /// Weight that it had in the loss.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub kl_weight: Option<f64>,
 }
 
 /// A training run.
 pub struct RelativeTrainer {
+    state: State,
+    config: RelativeTrainConfig,
+    source: Arc<BatchSource>,
+    excluded: RewardExclusions,
+    next: BatchReceiver,
+}
+
+/// What changes in a run, and what of its beginning is still needed.
+struct State {
     trained: RelativeNetwork,
     average: RelativeNetwork,
     optimizer: AdamW,
-    config: RelativeTrainConfig,
     step: usize,
-    source: Arc<BatchSource>,
     /// The network that drives the agents of samples, as of the last update.
     driving: Option<RelativeNetwork>,
-    excluded: RewardExclusions,
-    next: Receiver<Result<Batch, TrainError>>,
-}
-
-/// The data of a step.
-struct Batch {
-    samples: Vec<Sample>,
-    group: Option<Group>,
-}
-
-/// The driving network, for drives and for rewards.
-#[derive(Default)]
-struct Drivers {
-    driver: Option<NetworkDriver>,
-    judged: Option<Judged>,
-}
-
-struct BatchSource {
-    scenarios: Box<dyn ScenarioSource>,
-    config: SampleConfig,
-    seed: Seed,
-    batch: usize,
-}
-
-impl BatchSource {
-    fn batch(&self, step: usize, drivers: &Drivers) -> Result<Batch, TrainError> {
-        let group = drivers.judged.as_ref();
-        let group = group.map(|judged| self.group(step, judged));
-        Ok(Batch {
-            samples: self.samples(step, drivers.driver.as_ref())?,
-            group: group.transpose()?,
-        })
-    }
-
-    fn group(&self, step: usize, judged: &Judged) -> Result<Group, TrainError> {
-        let seed = self.seed.fork(step as u64).fork(GROUP);
-        for attempt in 0..ATTEMPTS {
-            let seed = seed.fork(attempt);
-            let scenario = self.scenarios.pick(step, seed.fork(0).0);
-            let scenario = self.scenarios.get(scenario)?;
-            if let Some(mut group) = judged.group(&scenario, seed.fork(1))? {
-                group.excluded.scenes = attempt as usize;
-                return Ok(group);
-            }
-        }
-        Err(TrainError::NoComparableScene)
-    }
-
-    fn samples(
-        &self,
-        step: usize,
-        driver: Option<&NetworkDriver>,
-    ) -> Result<Vec<Sample>, TrainError> {
-        let seed = self.seed.fork(step as u64);
-        let drawn = (0..self.batch).map(|i| {
-            let seed = seed.fork(i as u64);
-            for attempt in 0..ATTEMPTS {
-                let seed = seed.fork(attempt);
-                let scenario = self.scenarios.pick(step, seed.fork(0).0);
-                let scenario = self.scenarios.get(scenario)?;
-                let sample = draw(
-                    &scenario,
-                    &self.config,
-                    driver.map(|d| d as _),
-                    seed.fork(1),
-                );
-                if let Some(sample) = sample.filter(|sample| !sample.targets.is_empty()) {
-                    return Ok(sample);
-                }
-            }
-            Err(TrainError::NoData { frames: 3 })
-        });
-        drawn.collect()
-    }
-}
-
-fn prefetch(
-    source: &Arc<BatchSource>,
-    step: usize,
-    drivers: Drivers,
-) -> Receiver<Result<Batch, TrainError>> {
-    let (sender, receiver) = channel();
-    let source = Arc::clone(source);
-    // A receiver that is gone belongs to a trainer that is gone.
-    std::thread::spawn(move || drop(sender.send(source.batch(step, &drivers))));
-    receiver
+    /// Keeps the network near that of the beginning.
+    tether: Option<Tether>,
 }
 
 impl RelativeTrainer {
@@ -254,10 +185,17 @@ impl RelativeTrainer {
         scenarios: impl ScenarioSource + 'static,
     ) -> Result<Self, TrainError> {
         let average = build_like(&network, copies(&network)?)?;
-        let optimizer = AdamW::new(network.parameters())?;
-        let driving = driving(&average, &config)?;
-        let run = (network, average, driving);
-        Self::assemble(run, optimizer, config, 0, Box::new(scenarios))
+        let begin = || build_like(&network, copies(&network)?);
+        let tether = Tether::begin(config.realism.as_ref(), begin)?;
+        let state = State {
+            optimizer: AdamW::new(network.parameters())?,
+            step: 0,
+            driving: driving(&average, &config)?,
+            tether,
+            trained: network,
+            average,
+        };
+        Self::assemble(state, config, Box::new(scenarios))
     }
 
     /// Continues a run from its checkpoint, exactly as if it had not been interrupted.
@@ -283,25 +221,33 @@ impl RelativeTrainer {
         let mut moments = archive.take(checkpoint::OPTIMIZER);
         let trained = archive.take(checkpoint::TRAINED);
         let driver = archive.take(checkpoint::DRIVER);
+        let reference = archive.take(checkpoint::REFERENCE);
         let build =
             |weights| RelativeNetwork::build(model.clone(), Parameters::loaded(weights, device));
-        let (network, average) = (build(trained)?, build(archive.tensors)?);
         let driving = (!driver.is_empty()).then(|| build(driver)).transpose()?;
+        let tether = Tether::begin(config.realism.as_ref(), || Ok(build(reference)?))?;
+        let tether = tether.map(|tether| tether.restored(&archive)).transpose()?;
+        let (network, average) = (build(trained)?, build(archive.tensors)?);
         let optimizer = AdamW::restore(network.parameters(), step, |name| {
             let tensor = moments.remove(name);
             tensor.ok_or_else(|| NnError::MissingTensor {
                 name: name.to_owned(),
             })
         })?;
-        let run = (network, average, driving);
-        Self::assemble(run, optimizer, config, step, Box::new(scenarios))
+        let state = State {
+            trained: network,
+            average,
+            optimizer,
+            step,
+            driving,
+            tether,
+        };
+        Self::assemble(state, config, Box::new(scenarios))
     }
 
     fn assemble(
-        (network, average, driving): (RelativeNetwork, RelativeNetwork, Option<RelativeNetwork>),
-        optimizer: AdamW,
+        state: State,
         config: RelativeTrainConfig,
-        step: usize,
         scenarios: Box<dyn ScenarioSource>,
     ) -> Result<Self, TrainError> {
         config.validate()?;
@@ -314,15 +260,12 @@ impl RelativeTrainer {
             seed: Seed(config.seed).fork(1),
             batch: config.batch,
         });
-        let next = prefetch(&source, step, drivers(driving.as_ref(), &config)?);
+        let drivers = Drivers::new(state.driving.as_ref(), &config)?;
+        let next = prefetch(&source, state.step, drivers);
         Ok(Self {
-            trained: network,
-            average,
-            optimizer,
+            state,
             config,
-            step,
             source,
-            driving,
             excluded: RewardExclusions::default(),
             next,
         })
@@ -336,94 +279,34 @@ impl RelativeTrainer {
     /// One optimiser step.
     ///
     /// # Errors
-    /// [`TrainError::LossNotFinite`] or [`TrainError::GradientNotFinite`] before anything is changed, or
-    /// errors of drawing samples.
+    /// [`TrainError::LossNotFinite`], [`TrainError::GradientNotFinite`] or [`TrainError::TooFar`]
+    /// before anything is changed, or errors of drawing samples.
     pub fn step(&mut self) -> Result<RelativeStep, TrainError> {
         let drawn = self.next.recv();
-        let Batch { samples, group } = drawn.unwrap_or(Err(TrainError::NoData { frames: 3 }))?;
-        let refresh = self.config.refresh();
-        if refresh.is_some_and(|refresh| self.step.is_multiple_of(refresh)) {
-            self.driving = driving(&self.average, &self.config)?;
+        let batch = drawn.unwrap_or(Err(TrainError::NoData { frames: 3 }))?;
+        let (config, state) = (&self.config, &mut self.state);
+        let is_due = |refresh| state.step.is_multiple_of(refresh);
+        let renewed = match config.refresh().is_some_and(is_due) {
+            true => driving(&state.average, config)?,
+            false => None,
+        };
+        let drivers = Drivers::new(renewed.as_ref().or(state.driving.as_ref()), config)?;
+        let upcoming = prefetch(&self.source, state.step + 1, drivers);
+        let report = match state.learn(&batch, config) {
+            Ok(report) => report,
+            Err(error) => {
+                self.next = batch.again();
+                return Err(error);
+            }
+        };
+        self.next = upcoming;
+        if renewed.is_some() {
+            state.driving = renewed;
         }
-        let drivers = drivers(self.driving.as_ref(), &self.config)?;
-        self.next = prefetch(&self.source, self.step + 1, drivers);
-        let left_out = group
-            .as_ref()
-            .map(|group| group.excluded)
-            .unwrap_or_default();
+        let left_out = batch.group.map(|group| group.excluded).unwrap_or_default();
         self.excluded.scenes += left_out.scenes;
         self.excluded.agents += left_out.agents;
-        let total = weight(&samples);
-        let (network, smoothing) = (&self.trained, self.config.smoothing_bins);
-        let operands = match self.config.mixed_precision {
-            true => Operands::Bf16,
-            false => Operands::F32,
-        };
-        let judged = group.as_ref().map_or(&[][..], |group| &group.samples);
-        let n_judged: usize = judged.iter().map(|sample| sample.targets.len()).sum();
-        let rewards = self.config.realism.as_ref();
-        let judged_total = rewards.map_or(1.0, |rewards| n_judged as f64 / rewards.weight);
-        let imitated = samples.par_iter().map(|sample| (sample, true));
-        let preferred = judged
-            .par_iter()
-            .filter(|sample| !sample.targets.is_empty());
-        let all = imitated.chain(preferred.map(|sample| (sample, false)));
-        let parts = all.map(|(sample, imitates)| {
-            let deferred = Deferred::default();
-            let build = || match imitates {
-                true => network.loss(sample, total, smoothing),
-                false => network.preference(sample, judged_total),
-            };
-            let (loss, sums) = operands.during(|| deferred.during(build))?;
-            Ok(Part {
-                gradients: loss.backward()?,
-                deferred,
-                sums,
-            })
-        });
-        let parts: Vec<_> = parts.collect::<Result<_, TrainError>>()?;
-        let imitated = parts[..samples.len()].iter();
-        let fields = mean_fields(imitated.map(|part| &part.sums), total);
-        let loss: f64 = fields.iter().sum();
-        if !loss.is_finite() {
-            let field = "move".to_owned();
-            return Err(TrainError::LossNotFinite {
-                step: self.step,
-                field,
-            });
-        }
-        let trainable: Vec<_> = self.trained.parameters().trainable().collect();
-        let sums = trainable.into_par_iter().map(|(name, var)| {
-            let mut of_samples = parts.iter().filter_map(|part| part.gradients.get(var));
-            let sum = match of_samples.next() {
-                Some(first) => {
-                    Some(of_samples.try_fold(first.clone(), |sum, gradient| sum + gradient)?)
-                }
-                None => None,
-            };
-            let deferred = parts.iter().map(|part| &part.deferred);
-            let sum = Deferred::take_in(deferred, var, sum)?;
-            Ok(sum.map(|sum| (name.to_owned(), sum)))
-        });
-        let sums: Vec<_> = sums.collect::<Result<_, TrainError>>()?;
-        let gradients: Gradients = sums.into_iter().flatten().collect();
-        let update = Update {
-            parameters: self.trained.parameters(),
-            average: Some((self.average.parameters(), self.config.ema)),
-            optimizer: &self.config.optimizer,
-            steps: self.config.steps,
-        };
-        let (gradient_norm, rate) =
-            update.learn(&mut self.optimizer, &mut self.step, &gradients)?;
-        Ok(RelativeStep {
-            step: self.step,
-            loss,
-            fields,
-            gradient_norm,
-            learning_rate: rate,
-            nodes: samples.iter().chain(judged).map(Sample::n_nodes).sum(),
-            rollouts: group.as_ref().map(|group| group.realism),
-        })
+        Ok(report)
     }
 
     /// The loss on other scenarios, without hiding and smoothing; by field, nats.
@@ -445,7 +328,7 @@ impl RelativeTrainer {
             return Err(TrainError::NoData { frames: 3 });
         }
         let total = weight(&samples);
-        let network = &self.average;
+        let network = &self.state.average;
         let sums = samples
             .par_iter()
             .map(|sample| Ok(network.loss(sample, total, 0.0)?.1));
@@ -463,29 +346,34 @@ impl RelativeTrainer {
             all.map(|(name, var)| (format!("{prefix}{name}"), var.as_tensor().clone()))
                 .collect()
         };
-        let mut tensors = named("", &self.average);
-        tensors.extend(named(checkpoint::TRAINED, &self.trained));
-        if let Some(driving) = &self.driving {
+        let state = &self.state;
+        let mut tensors = named("", &state.average);
+        tensors.extend(named(checkpoint::TRAINED, &state.trained));
+        if let Some(driving) = &state.driving {
             tensors.extend(named(checkpoint::DRIVER, driving));
         }
-        let state = self.optimizer.state();
-        tensors.extend(state.map(|(name, tensor)| (name, tensor.clone())));
-        let mut header = gump_model::relative::header(self.trained.config())?;
+        let moments = state.optimizer.state();
+        tensors.extend(moments.map(|(name, tensor)| (name, tensor.clone())));
+        let mut header = gump_model::relative::header(state.trained.config())?;
+        if let Some(tether) = &state.tether {
+            tensors.extend(named(checkpoint::REFERENCE, tether.reference()));
+            header.extend([tether.entry()]);
+        }
         let config = serde_json::to_string(&self.config).map_err(TrainError::Json)?;
         header.insert("train".to_owned(), config);
-        header.insert("step".to_owned(), self.step.to_string());
+        header.insert("step".to_owned(), state.step.to_string());
         header.insert(DATA.to_owned(), self.source.scenarios.identity());
         Ok(checkpoint::write(path, tensors, header, StorageType::Full)?)
     }
 
     /// Ends the run and returns the network to use.
     pub fn into_network(self) -> RelativeNetwork {
-        self.average
+        self.state.average
     }
 
     /// Steps done.
     pub fn steps_done(&self) -> usize {
-        self.step
+        self.state.step
     }
 
     /// Its settings.
@@ -495,7 +383,7 @@ impl RelativeTrainer {
 
     /// The network to use, in its present state: the moving average.
     pub fn network(&self) -> &RelativeNetwork {
-        &self.average
+        &self.state.average
     }
 
     /// A copy of it, for a world that is used while training continues.
@@ -503,7 +391,7 @@ impl RelativeTrainer {
     /// # Errors
     /// A tensor error.
     pub fn snapshot(&self) -> Result<RelativeNetwork, TrainError> {
-        build_like(&self.average, copies(&self.average)?)
+        build_like(&self.state.average, copies(&self.state.average)?)
     }
 }
 
@@ -517,20 +405,6 @@ fn driving(
     copied.transpose()
 }
 
-fn drivers(
-    driving: Option<&RelativeNetwork>,
-    config: &RelativeTrainConfig,
-) -> Result<Drivers, TrainError> {
-    let driver = driving.zip(config.closed_loop.as_ref());
-    let driver = driver.map(|(network, drives)| NetworkDriver::new(network, drives));
-    let judged = driving.zip(config.realism.as_ref());
-    let judged = judged.map(|(network, rewards)| Judged::new(network, rewards));
-    Ok(Drivers {
-        driver: driver.transpose()?,
-        judged: judged.transpose()?,
-    })
-}
-
 /// The result for one sample of a step.
 struct Part {
     gradients: GradStore,
@@ -538,6 +412,130 @@ struct Part {
     deferred: Deferred,
     /// Sums of the fields' cross-entropies, nats.
     sums: [f64; FIELDS],
+    /// Sums over rewarded moves, nats; 0 for other samples.
+    entropy: f64,
+    divergence: f64,
+}
+
+impl State {
+    /// One step on a batch.
+    ///
+    /// Error: as [`RelativeTrainer::step`], and nothing has changed.
+    fn learn(
+        &mut self,
+        batch: &Batch,
+        config: &RelativeTrainConfig,
+    ) -> Result<RelativeStep, TrainError> {
+        let judged = batch.judged();
+        let n_moves: usize = judged.iter().map(|sample| sample.targets.len()).sum();
+        let total = weight(&batch.samples);
+        let parts = self.differentiate(&batch.samples, &judged, (total, n_moves), config)?;
+        let (imitated, preferred) = parts.split_at(batch.samples.len());
+        let fields = mean_fields(imitated.iter().map(|part| &part.sums), total);
+        let loss: f64 = fields.iter().sum();
+        if !loss.is_finite() {
+            let (step, field) = (self.step, "move".to_owned());
+            return Err(TrainError::LossNotFinite { step, field });
+        }
+        let mean = |of: fn(&Part) -> f64| {
+            let sum: f64 = preferred.iter().map(of).sum();
+            (n_moves > 0).then_some(sum / n_moves as f64)
+        };
+        let entropy = mean(|part| part.entropy);
+        let tether = self.tether.as_ref().filter(|_| n_moves > 0);
+        let kl_weight = tether.map(Tether::weight);
+        let kl = mean(|part| part.divergence).filter(|_| tether.is_some());
+        if let Some((tether, kl)) = tether.zip(kl) {
+            tether.check(kl, self.step)?;
+        }
+        let gradients = summed(self.trained.parameters(), &parts)?;
+        let update = Update {
+            parameters: self.trained.parameters(),
+            average: Some((self.average.parameters(), config.ema)),
+            optimizer: &config.optimizer,
+            steps: config.steps,
+        };
+        let (gradient_norm, rate) =
+            update.learn(&mut self.optimizer, &mut self.step, &gradients)?;
+        if let Some((tether, kl)) = self.tether.as_mut().zip(kl) {
+            tether.observe(kl);
+        }
+        Ok(RelativeStep {
+            step: self.step,
+            loss,
+            fields,
+            gradient_norm,
+            learning_rate: rate,
+            nodes: batch.n_nodes(),
+            rollouts: batch.group.as_ref().map(|group| group.realism),
+            entropy,
+            kl,
+            kl_weight,
+        })
+    }
+
+    /// Gradients of the samples that are imitated, then of those that are rewarded; given the weight
+    /// of the moves of the former and the number of the latter's.
+    fn differentiate(
+        &self,
+        imitated: &[Sample],
+        judged: &[&Sample],
+        (total, n_moves): (f64, usize),
+        config: &RelativeTrainConfig,
+    ) -> Result<Vec<Part>, TrainError> {
+        let (network, smoothing) = (&self.trained, config.smoothing_bins);
+        let operands = match config.mixed_precision {
+            true => Operands::Bf16,
+            false => Operands::F32,
+        };
+        let rewards = config.realism.as_ref();
+        let judged_total = rewards.map_or(1.0, |rewards| n_moves as f64 / rewards.weight);
+        let anchor = self.tether.as_ref().map(|tether| tether.anchor(n_moves));
+        let imitated = imitated.par_iter().map(|sample| (sample, true));
+        let preferred = judged.par_iter().map(|sample| (*sample, false));
+        let parts = imitated.chain(preferred).map(|(sample, imitates)| {
+            let deferred = Deferred::default();
+            let build = || match imitates {
+                true => {
+                    let (loss, sums) = network.loss(sample, total, smoothing)?;
+                    Ok((loss, sums, 0.0, 0.0))
+                }
+                false => {
+                    let found = network.preference(sample, judged_total, anchor)?;
+                    Ok((found.loss, found.sums, found.entropy, found.divergence))
+                }
+            };
+            let built: candle_core::Result<_> = operands.during(|| deferred.during(build));
+            let (loss, sums, entropy, divergence) = built?;
+            Ok(Part {
+                gradients: loss.backward()?,
+                deferred,
+                sums,
+                entropy,
+                divergence,
+            })
+        });
+        parts.collect()
+    }
+}
+
+/// Gradients of all parts together.
+fn summed(parameters: &Parameters, parts: &[Part]) -> Result<Gradients, TrainError> {
+    let trainable: Vec<_> = parameters.trainable().collect();
+    let sums = trainable.into_par_iter().map(|(name, var)| {
+        let mut of_samples = parts.iter().filter_map(|part| part.gradients.get(var));
+        let sum = match of_samples.next() {
+            Some(first) => {
+                Some(of_samples.try_fold(first.clone(), |sum, gradient| sum + gradient)?)
+            }
+            None => None,
+        };
+        let deferred = parts.iter().map(|part| &part.deferred);
+        let sum = Deferred::take_in(deferred, var, sum)?;
+        Ok(sum.map(|sum| (name.to_owned(), sum)))
+    });
+    let sums: Vec<_> = sums.collect::<Result<_, TrainError>>()?;
+    Ok(sums.into_iter().flatten().collect())
 }
 
 fn weight(samples: &[Sample]) -> f64 {

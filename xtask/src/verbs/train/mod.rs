@@ -469,6 +469,9 @@ fn write(run: &Run, files: &Files, trainer: &impl Learns, losses: &Losses) -> an
     if let Some(chart) = losses.realism_chart() {
         chart.save(&path("realism"))?;
     }
+    if let Some(chart) = losses.rewards_chart() {
+        chart.save(&path("rewards"))?;
+    }
     Ok(())
 }
 

@@ -156,6 +156,9 @@ impl Learns for PlacementTrainer {
             gradient_norm: step.gradient_norm,
             tokens: step.vehicles,
             rollouts: None,
+            entropy: None,
+            kl: None,
+            kl_weight: None,
         })
     }
 

@@ -9,7 +9,7 @@ use gump_model::relative::{RelativeConfig, RelativeNetwork};
 use gump_model::{Device, relative};
 use gump_rollout::WorldModel;
 use gump_scene::{Scenario, Seed};
-use gump_train::relative::{RelativeTrainConfig, RelativeTrainer};
+use gump_train::relative::{RelativeDrives, RelativeRewards, RelativeTrainConfig, RelativeTrainer};
 use gump_train::{LossParts, ProcessGroup as _, StepReport, TrainError};
 use serde::Deserialize;
 use serde_json::{Map, json};
@@ -153,6 +153,11 @@ fn train(
         scenarios: &validation,
         judge: Judge::new(&validation, args.realism_rollouts, seed),
     };
+    let realism = trainer.config().realism.as_ref();
+    if !resume && realism.is_some_and(|rewards| rewards.kl_bound.is_some()) {
+        // A run that goes too far keeps its last checkpoint: there has to be one.
+        write(run, &stage.files, &trainer, &losses)?;
+    }
     let began = std::time::Instant::now();
     let trained = run.phase("train", |run| {
         learn(
@@ -164,7 +169,12 @@ fn train(
             true,
         )
     });
-    run.phase("write", |run| write(run, &stage.files, &trainer, &losses))?;
+    let error = trained.as_ref().err();
+    match error.and_then(|error| error.downcast_ref::<TrainError>()) {
+        // The network has just been found too far away: the last one written is nearer.
+        Some(TrainError::TooFar { .. }) => losses.write(&run.path(&stage.files.path(LOSSES)))?,
+        _ => run.phase("write", |run| write(run, &stage.files, &trainer, &losses))?,
+    }
     trained?;
     run.result("parameters", trainer.network().parameters().count())?;
     report_run(run, &trainer, &losses, resumed_at, began)?;
@@ -225,9 +235,14 @@ fn known_keys() -> anyhow::Result<Table> {
     known.insert("model".into(), NAME.into());
     let shape = Table::try_from(RelativeConfig::default())?;
     known.insert("relative".into(), shape.into());
+    let realism = RelativeRewards {
+        kl_target: Some(0.0),
+        kl_bound: Some(0.0),
+        ..RelativeRewards::default()
+    };
     let train = RelativeTrainConfig {
-        closed_loop: Some(gump_train::relative::RelativeDrives::default()),
-        realism: Some(gump_train::relative::RelativeRewards::default()),
+        closed_loop: Some(RelativeDrives::default()),
+        realism: Some(realism),
         ..RelativeTrainConfig::default()
     };
     known.insert("train".into(), Table::try_from(train)?.into());
@@ -258,6 +273,9 @@ impl Learns for RelativeTrainer {
             gradient_norm: step.gradient_norm,
             tokens: step.nodes,
             rollouts: step.rollouts,
+            entropy: step.entropy,
+            kl: step.kl,
+            kl_weight: step.kl_weight,
         })
     }
 

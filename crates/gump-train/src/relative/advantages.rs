@@ -1,0 +1,250 @@
+//! From the worth of rollouts to the advantage of each of their moves.
+
+use gump_wosac::realism::{Component, Evaluation, LeaveOneOut};
+
+use crate::relative::settings::{Advantage, RelativeRewards};
+
+/// Advantages are clipped to this many standard deviations, so that rare ones do not outweigh a
+/// batch. Chosen by hand.
+const MOST: f64 = 3.0;
+/// Differences of returns smaller than this are rounding and ignored, in units of the metametric.
+const LEAST: f64 = 1e-9;
+
+/// Numbers of the moves of each future, `[future][agent, move]`.
+pub(super) type ByMove = Vec<Vec<f64>>;
+
+/// The scored steps at which agents first collide and first leave the road, per future and agent.
+pub(super) type Faults = [Vec<Vec<Option<usize>>>; 2];
+
+/// The faults that the metric finds in the futures of an evaluation.
+pub(super) fn faults(evaluation: &Evaluation<'_>) -> Faults {
+    [Component::Collision, Component::Offroad].map(|fault| evaluation.first_indications(fault))
+}
+
+/// The advantage of every move of the scored agents; `None` if all futures are equally good.
+/// `realism` is the metametric of all futures, `per_move` the number of scored steps of a move.
+///
+/// The returns of the futures minus their mean, in standard deviations of the group; a dense term
+/// is added in that unit, less its own mean over the futures.
+pub(super) fn advantages(
+    rewards: &RelativeRewards,
+    (realism, worth): (f64, &LeaveOneOut),
+    faults: &Faults,
+    per_move: usize,
+) -> Option<ByMove> {
+    let n_moves = worth.n_steps / per_move;
+    let returns = match rewards.advantage {
+        Advantage::Agent => returns(worth, per_move),
+        Advantage::Scene => {
+            let n = worth.agents.len() * n_moves;
+            let others = worth.metametric.iter();
+            others.map(|others| vec![realism - others; n]).collect()
+        }
+    };
+    let credited = standardized(returns);
+    if rewards.dense == 0.0 {
+        return Some(clipped(credited?));
+    }
+    let (mut penalties, differ) = centred(penalties(faults, n_moves, per_move));
+    if credited.is_none() && differ == 0.0 {
+        return None;
+    }
+    for (i, own) in penalties.iter_mut().enumerate() {
+        for (at, penalty) in own.iter_mut().enumerate() {
+            *penalty *= rewards.dense;
+            *penalty += credited.as_ref().map_or(0.0, |credited| credited[i][at]);
+        }
+    }
+    Some(clipped(penalties))
+}
+
+/// The return of each move: the parts of its agent from its own step on.
+fn returns(worth: &LeaveOneOut, per_move: usize) -> ByMove {
+    let of_future = |credit: &Vec<f64>| {
+        let agents = credit.chunks(worth.n_steps);
+        agents.flat_map(|own| to_go(own, per_move)).collect()
+    };
+    worth.credit.iter().map(of_future).collect()
+}
+
+/// The return of each move, given the reward at each step.
+fn to_go(credit: &[f64], per_move: usize) -> Vec<f64> {
+    let mut earned: Vec<f64> = credit
+        .chunks_exact(per_move)
+        .map(|steps| steps.iter().sum())
+        .collect();
+    for k in (1..earned.len()).rev() {
+        earned[k - 1] += earned[k];
+    }
+    earned
+}
+
+/// For each move minus one for each fault that its agent first commits in it or later.
+fn penalties(faults: &Faults, n_moves: usize, per_move: usize) -> ByMove {
+    let [collisions, exits] = faults;
+    let of_agent = |(collision, exit): (&Option<usize>, &Option<usize>)| {
+        let mut rewards = vec![0.0; n_moves * per_move];
+        for step in [collision, exit].into_iter().flatten() {
+            // Steps after the last whole move belong to none.
+            if let Some(reward) = rewards.get_mut(*step) {
+                *reward -= 1.0;
+            }
+        }
+        to_go(&rewards, per_move)
+    };
+    let futures = collisions.iter().zip(exits);
+    let of_future = |(collisions, exits): (&Vec<_>, &Vec<_>)| {
+        collisions.iter().zip(exits).flat_map(of_agent).collect()
+    };
+    futures.map(of_future).collect()
+}
+
+/// Less the mean over the futures; with the sum of squares that is left.
+fn centred(mut all: ByMove) -> (ByMove, f64) {
+    let n = all.len() as f64;
+    let n_moves = all.first().map_or(0, Vec::len);
+    let mut squares = 0.0;
+    for at in 0..n_moves {
+        let mean = all.iter().map(|earned| earned[at]).sum::<f64>() / n;
+        for earned in &mut all {
+            earned[at] -= mean;
+            squares += earned[at] * earned[at];
+        }
+    }
+    (all, squares)
+}
+
+/// Less the mean over the futures, in standard deviations of the group; `None` if the differences
+/// are negligible.
+fn standardized(all: ByMove) -> Option<ByMove> {
+    let n = all.len() * all.first()?.len();
+    let (mut all, squares) = centred(all);
+    let spread = (squares / n as f64).sqrt();
+    if spread.is_nan() || spread <= LEAST {
+        return None;
+    }
+    all.iter_mut().flatten().for_each(|own| *own /= spread);
+    Some(all)
+}
+
+fn clipped(mut all: ByMove) -> ByMove {
+    let moves = all.iter_mut().flatten();
+    moves.for_each(|own| *own = own.clamp(-MOST, MOST));
+    all
+}
+
+#[cfg(test)]
+mod tests {
+    use gump_scene::AgentId;
+
+    use super::*;
+
+    /// Two agents with four steps, two moves each.
+    fn worth() -> LeaveOneOut {
+        LeaveOneOut {
+            metametric: vec![0.5, 0.6, 0.55],
+            agents: vec![AgentId(1), AgentId(2)],
+            n_steps: 4,
+            credit: vec![
+                vec![0.0, 0.1, 0.2, 0.0, 0.0, 0.0, 0.1, 0.1],
+                vec![0.1, 0.0, 0.0, -0.1, 0.2, 0.0, 0.0, 0.0],
+                vec![0.0, 0.0, 0.1, 0.0, 0.0, 0.1, 0.0, 0.3],
+            ],
+        }
+    }
+
+    const REALISM: f64 = 0.58;
+
+    fn nobody() -> Faults {
+        [vec![vec![None; 2]; 3], vec![vec![None; 2]; 3]]
+    }
+
+    fn found(rewards: &RelativeRewards, worth: &LeaveOneOut, faults: &Faults) -> Option<ByMove> {
+        advantages(rewards, (REALISM, worth), faults, 2)
+    }
+
+    fn rewards(advantage: Advantage, dense: f64) -> RelativeRewards {
+        RelativeRewards {
+            advantage,
+            dense,
+            ..RelativeRewards::default()
+        }
+    }
+
+    fn close(found: f64, expected: f64) {
+        assert!((found - expected).abs() < 1e-12, "{found} {expected}");
+    }
+
+    #[test]
+    fn moves_of_an_agent_are_credited_with_what_follows() {
+        let found = found(&rewards(Advantage::Agent, 0.0), &worth(), &nobody()).unwrap();
+        let returns = [
+            [0.3, 0.2, 0.2, 0.2],
+            [0.0, -0.1, 0.2, 0.0],
+            [0.1, 0.1, 0.4, 0.3],
+        ];
+        let mean = |at: usize| returns.iter().map(|own| own[at]).sum::<f64>() / 3.0;
+        let off = |i: usize, at: usize| returns[i][at] - mean(at);
+        let places = || (0..3).flat_map(|i| (0..4).map(move |at| (i, at)));
+        let squares: f64 = places().map(|(i, at)| off(i, at).powi(2)).sum();
+        let spread = (squares / 12.0).sqrt();
+        places().for_each(|(i, at)| close(found[i][at], off(i, at) / spread));
+    }
+
+    #[test]
+    fn moves_of_a_future_are_credited_with_its_worth() {
+        let found = found(&rewards(Advantage::Scene, 0.0), &worth(), &nobody()).unwrap();
+        // What each future adds, less the mean; the others are worth 0.5, 0.6 and 0.55.
+        let off = [0.05, -0.05, 0.0];
+        let spread = (2.0 * 0.05f64.powi(2) / 3.0).sqrt();
+        for (own, off) in found.iter().zip(off) {
+            assert_eq!(own.len(), 4);
+            own.iter().for_each(|own| close(*own, off / spread));
+        }
+        let equal = LeaveOneOut {
+            metametric: vec![0.5; 3],
+            ..worth()
+        };
+        let scene = rewards(Advantage::Scene, 0.0);
+        assert!(self::found(&scene, &equal, &nobody()).is_none());
+    }
+
+    #[test]
+    fn a_collision_lowers_the_advantages_of_the_moves_before_it() {
+        let mut faults = nobody();
+        // The second agent of the first future collides in its second move, and the first agent of
+        // the third leaves the road in its first.
+        faults[0][0][1] = Some(2);
+        faults[1][2][0] = Some(1);
+        for advantage in [Advantage::Agent, Advantage::Scene] {
+            let plain = found(&rewards(advantage, 0.0), &worth(), &faults).unwrap();
+            let dense = found(&rewards(advantage, 0.3), &worth(), &faults).unwrap();
+            let change = |i: usize, at: usize| dense[i][at] - plain[i][at];
+            // Two thirds of the weight less than before; the other futures share what it lost.
+            for at in [2, 3] {
+                close(change(0, at), -0.2);
+                close(change(1, at), 0.1);
+            }
+            close(change(2, 0), -0.2);
+            close(change(0, 0), 0.1);
+            close(change(2, 1), 0.0);
+        }
+        // It is enough on its own to compare futures that realism does not tell apart.
+        let equal = LeaveOneOut {
+            metametric: vec![0.5; 3],
+            ..worth()
+        };
+        let alone = found(&rewards(Advantage::Scene, 0.3), &equal, &faults).unwrap();
+        close(alone[0][3], -0.2);
+        let scene = rewards(Advantage::Scene, 0.3);
+        assert!(found(&scene, &equal, &nobody()).is_none());
+    }
+
+    #[test]
+    fn advantages_are_clipped() {
+        let mut faults = nobody();
+        faults[0][0][1] = Some(2);
+        let found = found(&rewards(Advantage::Agent, 100.0), &worth(), &faults).unwrap();
+        assert_eq!((found[0][2], found[1][2]), (-MOST, MOST));
+    }
+}
