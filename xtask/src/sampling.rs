@@ -47,6 +47,9 @@ pub(crate) struct Draw {
     /// No kinematic limits: vehicles and bicycles may turn on the spot, slip sideways and stop at once
     #[arg(long)]
     no_limits: bool,
+    /// Give the vehicles of a relative network routes, which they keep
+    #[arg(long)]
+    routes: bool,
     /// The network alone: no rejection sampling, no kinematic limits
     #[arg(long)]
     raw: bool,
@@ -122,6 +125,7 @@ impl Draw {
             decay: self.decay.unwrap_or(base.decay),
             redraws: self.redraws.unwrap_or(base.redraws),
             limits: base.limits && !self.no_limits,
+            routes: base.routes || self.routes,
             ..base
         };
         let absurd = |t: &f64| !(*t > 0.0 && t.is_finite());
@@ -217,6 +221,7 @@ mod tests {
             decay: None,
             redraws: None,
             no_limits: false,
+            routes: false,
             raw: false,
             paper: false,
             ruled: false,

@@ -52,6 +52,9 @@ pub struct SamplingConfig {
     pub yields_to_driven: bool,
     /// Whether kinematic limits apply to vehicles and bicycles (paper: no).
     pub limits: bool,
+    /// Whether the vehicles of a relative network are given routes, which they keep; the sequence network
+    /// has none.
+    pub routes: bool,
     /// The form in which the weights are multiplied (on a CPU; other devices compute as trained).
     pub precision: Precision,
 }
@@ -75,6 +78,7 @@ impl Default for SamplingConfig {
             redraws: 12,
             yields_to_driven: true,
             limits: true,
+            routes: false,
             precision: Precision::F32,
         }
     }
@@ -303,6 +307,7 @@ mod tests {
             redraws: 0,
             yields_to_driven: true,
             limits: false,
+            routes: false,
             precision: Precision::F32,
         };
         assert_eq!(SamplingConfig::raw(), raw);

@@ -3,6 +3,7 @@
 
 pub mod approach;
 pub mod engine;
+mod intent;
 pub mod keep_clear;
 pub mod right_of_way;
 pub mod rules;

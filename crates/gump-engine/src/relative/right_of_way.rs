@@ -7,6 +7,7 @@
 
 use gump_geometry::{DVec2, OrientedBox, angle_difference};
 use gump_model::relative::graph::{Lights, Shown};
+use gump_model::relative::route::Route;
 use gump_scene::{Lane, LightState, MapGraph};
 
 use crate::relative::approach::{
@@ -67,14 +68,25 @@ pub struct Course {
     now: Shown,
 }
 
-/// The ways ahead of a vehicle that is on a lane, shortest turn first.
-pub fn courses(streets: &MapGraph, lights: &Lights, now: &Shown) -> Vec<Course> {
+/// The ways ahead of a vehicle that is on a lane, shortest turn first; only that of its route, where it
+/// is on it.
+pub fn courses(
+    streets: &MapGraph,
+    lights: &Lights,
+    now: &Shown,
+    route: Option<&Route>,
+) -> Vec<Course> {
     let Some((lane, at)) = lane_under(streets, now.pose) else {
         return Vec::new();
     };
     let mut all = Vec::new();
     let mut way = vec![lane];
-    walk(streets, &mut way, lane.centerline.length() - at, &mut all);
+    walk(
+        (streets, route),
+        &mut way,
+        lane.centerline.length() - at,
+        &mut all,
+    );
     let course = |way: &Vec<&Lane>| course(streets, lights, now, way, at);
     let mut courses: Vec<Course> = all.iter().map(course).collect();
     courses.sort_by(|a, b| a.turn.abs().total_cmp(&b.turn.abs()));
@@ -83,7 +95,7 @@ pub fn courses(streets: &MapGraph, lights: &Lights, now: &Shown) -> Vec<Course> 
 
 /// Collects the ways from the last lane of `way`, which ends `metres` ahead.
 fn walk<'a>(
-    streets: &'a MapGraph,
+    (streets, route): (&'a MapGraph, Option<&Route>),
     way: &mut Vec<&'a Lane>,
     metres: f64,
     all: &mut Vec<Vec<&'a Lane>>,
@@ -94,10 +106,16 @@ fn walk<'a>(
         all.push(way.clone());
         return;
     }
-    for lane in next {
+    let meant = route.and_then(|route| route.after(last.id));
+    for lane in next.filter(|lane| meant.is_none_or(|meant| lane.id == meant)) {
         if all.len() < COURSES {
             way.push(lane);
-            walk(streets, way, metres + lane.centerline.length(), all);
+            walk(
+                (streets, route),
+                way,
+                metres + lane.centerline.length(),
+                all,
+            );
             way.pop();
         }
     }
@@ -373,6 +391,7 @@ impl Course {
 mod tests {
     use gump_geometry::{DVec3, Pose};
     use gump_model::relative::graph::Body;
+    use gump_model::relative::route::Traveller;
     use gump_scene::{AgentKind, LaneId, StopSign, fixture};
 
     use super::*;
@@ -414,9 +433,35 @@ mod tests {
         Shown::first(body, Pose::new(x, y, heading), velocity)
     }
 
+    #[test]
+    fn who_has_a_route_has_one_course() {
+        let map = &crossing(&[]);
+        let own = car((20.0, 0.0), WEST, 8.0);
+        let turns = |route: Option<&Route>| {
+            let courses = courses(map, &Lights::default(), &own, route);
+            let turns = courses.iter().map(|course| course.turn > TURNS);
+            turns.collect::<Vec<bool>>()
+        };
+        assert_eq!(turns(None), [false, true]);
+        for seed in (0..8).map(gump_scene::Seed) {
+            let speed = 8.0;
+            let who = |pose| Traveller { pose, speed, seed };
+            let route = Route::from_here(map, who(own.pose)).unwrap();
+            assert_eq!(turns(Some(&route)), [route.lanes()[1] == LaneId(12)]);
+        }
+        // One that it is not on tells nothing.
+        let other = Traveller {
+            pose: Pose::new(52.0, -40.0, SOUTH),
+            speed: 8.0,
+            seed: gump_scene::Seed(1),
+        };
+        let other = Route::from_here(map, other);
+        assert_eq!(turns(other.as_ref()), [false, true]);
+    }
+
     /// The greatest speeds of two vehicles for each other.
     fn speeds(map: &MapGraph, lights: &Lights, own: Shown, other: Shown) -> (f64, f64) {
-        let [own, other] = [own, other].map(|now| courses(map, lights, &now));
+        let [own, other] = [own, other].map(|now| courses(map, lights, &now, None));
         let of = |one: &[Course], to: &Vec<Course>| yielding_speed(one, &std::iter::once(&to[..]));
         (of(&own, &other), of(&other, &own))
     }
@@ -426,7 +471,7 @@ mod tests {
         let (signed, open) = (crossing(&[1]), crossing(&[]));
         let speed = |map: &MapGraph, x: f64, speed: f64| {
             let now = car((x, 0.0), WEST, speed);
-            speed_for_signs(&courses(map, &Lights::default(), &now))
+            speed_for_signs(&courses(map, &Lights::default(), &now, None))
         };
         // 7.75 m before the line; half a second later it slows down at 3 m/s² to 2.5 m/s there.
         let before = speed(&signed, 30.0, 8.0);

@@ -9,6 +9,7 @@
 use gump_geometry::{DVec2, Polyline, Pose, angle_difference};
 use gump_model::local_context::LaneMap;
 use gump_model::relative::graph::{Lights, Shown};
+use gump_model::relative::route::Route;
 use gump_model::steps::TOKEN_DT;
 use gump_scene::{
     AgentKind, AgentState, Lane, LaneId, Light, LightState, MapGraph, stop_line, ways_beyond,
@@ -201,11 +202,15 @@ pub(super) struct Shut<'l> {
 
 impl<'l> Shut<'l> {
     /// For agents with these lights, which show these colours. `unheeded` is one for which nobody waits;
-    /// `is_parked` says who closes no junction.
-    pub(super) fn of(
+    /// `is_parked` says who closes no junction, `route` where vehicles mean to go, if that is known.
+    pub(super) fn of<'r>(
         map: &MapGraph,
         agents: &[Shown],
-        (unheeded, is_parked): (Option<usize>, impl Fn(usize) -> bool),
+        (unheeded, is_parked, route): (
+            Option<usize>,
+            impl Fn(usize) -> bool,
+            impl Fn(usize) -> Option<&'r Route>,
+        ),
         lights: impl Iterator<Item = (&'l StopLine, LightState)>,
         colours: &Lights,
     ) -> Self {
@@ -221,7 +226,7 @@ impl<'l> Shut<'l> {
         };
         let ways = |i: usize| match agents[i].body.kind {
             AgentKind::Vehicle | AgentKind::Bicycle if counts(i) => {
-                courses(map, colours, &agents[i])
+                courses(map, colours, &agents[i], route(i))
             }
             _ => Vec::new(),
         };
@@ -570,7 +575,7 @@ mod tests {
             let shut = Shut::of(
                 &map,
                 &agents,
-                (None, |_| is_parked),
+                (None, |_| is_parked, |_| None),
                 std::iter::empty(),
                 &Lights::default(),
             );

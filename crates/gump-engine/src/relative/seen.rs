@@ -3,6 +3,7 @@
 use gump_geometry::{DVec2, Pose};
 use gump_model::relative::graph::{Body, Lights, PAST, Shown, look, past_edge};
 use gump_model::relative::map::VectorMap;
+use gump_model::relative::route::Route;
 use gump_scene::AgentKind;
 
 use crate::relative::engine::{AgentMemory, KEPT, MapMemory, Present, RelativeEngine};
@@ -13,6 +14,8 @@ pub struct ObservedAgent {
     /// The last frames without a gap, the latest last; at least one, at most [`KEPT`].
     shown: Vec<Shown>,
     memory: AgentMemory,
+    /// Where it means to go, if the network is told.
+    route: Option<Route>,
 }
 
 impl ObservedAgent {
@@ -21,6 +24,7 @@ impl ObservedAgent {
         Self {
             shown: vec![Shown::first(body, pose, velocity)],
             memory: engine.blank(),
+            route: None,
         }
     }
 
@@ -40,7 +44,20 @@ impl ObservedAgent {
     pub fn restart(&mut self, engine: &RelativeEngine, speed: f64) {
         let now = self.now();
         let velocity = now.pose.direction() * speed;
-        *self = Self::first(engine, now.body, now.pose, velocity);
+        *self = Self {
+            route: self.route.take(),
+            ..Self::first(engine, now.body, now.pose, velocity)
+        };
+    }
+
+    /// Where it means to go, if the network is told.
+    pub fn route(&self) -> Option<&Route> {
+        self.route.as_ref()
+    }
+
+    /// Sets where it means to go, which the network is told from now on.
+    pub fn head_for(&mut self, route: Option<Route>) {
+        self.route = route;
     }
 
     /// Advances by half a second to this pose.
@@ -77,7 +94,7 @@ pub fn add_presents<'a>(
     let agents: Vec<Shown> = seen.iter().map(|seen| seen.now()).collect();
     presents.extend(seen.into_iter().enumerate().map(|(i, seen)| {
         let now = &agents[i];
-        let mut view = look(map, lights, &agents, i);
+        let mut view = look(map, lights, &agents, i, seen.route.as_ref());
         let is_vehicle = now.body.kind == AgentKind::Vehicle;
         let past = match frame.is_late && is_vehicle && view.is_free(now) {
             true => 0,

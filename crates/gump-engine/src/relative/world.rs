@@ -33,6 +33,7 @@ use serde::{Deserialize, Serialize};
 use crate::EngineError;
 use crate::nucleus::uniform;
 use crate::relative::engine::{Draw, KEPT, MapMemory, RelativeEngine, Workspace};
+use crate::relative::intent::Intent;
 use crate::relative::rules::{
     Driven, Shut, StopLine, kinematically_limited, obey_lines, resolve, start,
 };
@@ -95,6 +96,8 @@ const REDRAW: u64 = 1 << 20;
 const SAMPLE_STREAMS: u64 = 1 << 40;
 /// The stream of patience, ...
 const PATIENCE: u64 = 1 << 41;
+/// ... and that of routes.
+const ROUTES: u64 = 1 << 42;
 
 /// Settings of rollouts.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -113,6 +116,8 @@ pub struct RelativeSampling {
     pub yields_to_driven: bool,
     /// Whether vehicles and bicycles are prevented from turning in place and slipping sideways.
     pub limits: bool,
+    /// Whether vehicles are given routes, which they keep.
+    pub routes: bool,
     /// The form in which the weights are multiplied.
     pub precision: Precision,
 }
@@ -125,6 +130,7 @@ impl Default for RelativeSampling {
             redraws: 0,
             yields_to_driven: true,
             limits: false,
+            routes: false,
             precision: Precision::F32,
         }
     }
@@ -140,6 +146,7 @@ impl From<&SamplingConfig> for RelativeSampling {
             redraws: config.redraws,
             yields_to_driven: config.yields_to_driven,
             limits: config.limits,
+            routes: config.routes,
             precision: config.precision,
         }
     }
@@ -292,6 +299,8 @@ pub(super) struct Scene {
     ego: AgentId,
     /// The lights that it may show.
     lights: Vec<Light>,
+    /// Whether vehicles are given routes.
+    has_routes: bool,
 }
 
 impl Scene {
@@ -327,6 +336,7 @@ impl Scene {
             centres,
             ego,
             lights: lights.to_vec(),
+            has_routes: sampling.routes,
         }
     }
 }
@@ -344,6 +354,8 @@ struct Member {
     has_driven: bool,
     /// Whether it stands in a lane although nothing holds it.
     could_go: bool,
+    /// Where it means to go.
+    intent: Intent,
 }
 
 /// One future in progress.
@@ -548,6 +560,9 @@ impl Future {
                 member.agent.state = driven;
             }
         }
+        if self.scene.has_routes {
+            self.choose_ways(ego.map(|_| id));
+        }
         for other in &mut self.others {
             other.state.pose.position += other.state.velocity * TOKEN_DT;
         }
@@ -557,6 +572,21 @@ impl Future {
         }
         self.lights_now.clone_from(&self.lights);
         self.limit_waiting(engine, ego.map(|_| id));
+    }
+
+    /// Lets vehicles keep to their routes, and gives one to those without; a driven ego has its own.
+    ///
+    /// Futures of a scene share its present: their routes begin half a second later.
+    fn choose_ways(&mut self, driven: Option<AgentId>) {
+        let (map, seed) = (&self.scene.source, self.seed.fork(ROUTES));
+        let members = self.members.iter_mut();
+        for member in members.filter(|member| driven != Some(member.agent.id)) {
+            let stream = seed.fork(member.agent.id.0 as u64);
+            let now = member.now();
+            member.intent.go_on(map, &now, stream, self.frames);
+            let route = member.intent.route().cloned();
+            member.seen.head_for(route);
+        }
     }
 
     /// Time after which an agent that stands although nothing holds it goes on, seconds.
@@ -668,7 +698,8 @@ impl Future {
             let member = &self.members[i];
             member.waited > PATIENCE_S[0] && !member.has_driven
         };
-        let who = (unheeded, is_parked);
+        let route = |i: usize| self.members[i].intent.route();
+        let who = (unheeded, is_parked, route);
         let shut = Shut::of(&self.scene.source, &agents, who, lines, &colours);
         obey_lines(&agents, driven, &shut, redraws, &mut moves, &mut again);
         // Redraws that keep agents clear of others must not make them cross such a line.
@@ -793,6 +824,7 @@ impl Member {
             idle: 0.0,
             has_driven: state.speed() > DRIVES,
             could_go: false,
+            intent: Intent::default(),
         }
     }
 
@@ -961,3 +993,6 @@ impl Session for RelativeSession<'_> {
         Ok(())
     }
 }
+
+#[cfg(test)]
+mod tests;

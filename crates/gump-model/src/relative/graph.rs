@@ -11,6 +11,7 @@ use gump_tokenizer::class_index;
 
 use crate::relative::grid::STILL_M;
 use crate::relative::map::{PATHS, PieceKind, VectorMap};
+use crate::relative::route::Route;
 use crate::steps::TOKEN_DT;
 
 // How much a node sees was chosen by hand, with the time of a frame in mind, and not varied except
@@ -329,16 +330,27 @@ impl View {
     }
 }
 
-/// The edges of agent `i` of those of a frame.
-pub fn look(map: &VectorMap, lights: &Lights, agents: &[Shown], i: usize) -> View {
+/// The edges of agent `i` of those of a frame. With a route there is one path ahead, along it.
+pub fn look(
+    map: &VectorMap,
+    lights: &Lights,
+    agents: &[Shown],
+    i: usize,
+    route: Option<&Route>,
+) -> View {
     let own = &agents[i];
     let mut view = View::default();
-    let paths = match own.body.kind {
+    let possible = match own.body.kind {
         AgentKind::Pedestrian => Vec::new(),
         _ => map.paths(own.pose),
     };
+    // A route is the only path ahead, and the lanes of the others are out of view.
+    let (paths, passed_by) = match route {
+        Some(route) => (vec![route.path(map, own.pose)], possible.concat()),
+        None => (possible, Vec::new()),
+    };
     neighbours(map, agents, i, &paths, &mut view);
-    pieces(map, lights, own, &paths, &mut view);
+    pieces(map, lights, own, (&paths, &passed_by), &mut view);
     view
 }
 
@@ -435,7 +447,14 @@ fn on_paths(map: &VectorMap, other: &Shown, paths: &Paths, row: &mut EdgeRow) {
     }
 }
 
-fn pieces(map: &VectorMap, lights: &Lights, own: &Shown, paths: &Paths, view: &mut View) {
+/// Pieces on the paths ahead and the nearest others but those passed by.
+fn pieces(
+    map: &VectorMap,
+    lights: &Lights,
+    own: &Shown,
+    (paths, passed_by): (&Paths, &[(u32, f64)]),
+    view: &mut View,
+) {
     let axes = Axes::of(own.pose);
     // Of a piece on several paths the first distance, which all share.
     let mut ahead: Vec<(u32, f64, [bool; PATHS])> = Vec::new();
@@ -461,7 +480,8 @@ fn pieces(map: &VectorMap, lights: &Lights, own: &Shown, paths: &Paths, view: &m
     let from = own.pose.position;
     let mut near: [Vec<(f64, u32)>; 3] = Default::default();
     for i in map.near(from, MAP_REACH_M) {
-        if ahead.iter().any(|known| known.0 == i) {
+        let is_known = ahead.iter().any(|known| known.0 == i);
+        if is_known || passed_by.iter().any(|passed| passed.0 == i) {
             continue;
         }
         let piece = &map.pieces[i as usize];
@@ -536,6 +556,7 @@ impl Writer<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::relative::route::Traveller;
 
     const CAR: Body = Body {
         kind: AgentKind::Vehicle,
@@ -567,7 +588,7 @@ mod tests {
                 let was = Shown::first(CAR, pose * Pose::new(x, y, 0.05), pose.rotate(DVec2::X));
                 was.then(pose * Pose::new(x + 2.0, y, 0.0))
             });
-            let view = look(&map, &Lights::default(), &agents, 0);
+            let view = look(&map, &Lights::default(), &agents, 0, None);
             (agents[0].numbers(), view)
         };
         let (own, here) = turned(Pose::IDENTITY);
@@ -587,6 +608,46 @@ mod tests {
         }
         // The car 30 m ahead in the lane is on the path.
         assert_eq!(here.neighbours[0].1[OF_PATH], 1.0);
+    }
+
+    #[test]
+    fn a_route_is_the_only_path_ahead() {
+        let scenario = gump_scene::fixture::scenario(
+            "lane 1: 0,0 60,0 speed 15 next 2,3
+             lane 2: 60,0 140,0
+             lane 3: 60,0 68,-2 70,-10 70,-80
+             ego vehicle 0: 40,0 velocity 8,0",
+        )
+        .unwrap();
+        let map = VectorMap::new(&scenario.map, DVec2::ZERO, 300.0, Default::default());
+        let pose = Pose::new(40.0, 0.0, 0.0);
+        let car = Shown::first(CAR, pose, DVec2::new(8.0, 0.0));
+        let lanes = |route: Option<&Route>| {
+            let view = look(&map, &Lights::default(), &[car], 0, route);
+            let lane = |(i, row): &(u32, EdgeRow)| {
+                let is_ahead = row[OF_PATH..][..PATHS].iter().any(|on| *on > 0.0);
+                (map.pieces[*i as usize].lane.map(|lane| lane.0), is_ahead)
+            };
+            let lanes = view.pieces.iter().map(lane);
+            lanes.collect::<std::collections::BTreeSet<_>>()
+        };
+        let without = lanes(None);
+        assert!(
+            [1, 2, 3]
+                .iter()
+                .all(|lane| without.contains(&(Some(*lane), true)))
+        );
+        for seed in (0..8).map(gump_scene::Seed) {
+            let speed = 8.0;
+            let route = Route::from_here(&scenario.map, Traveller { pose, speed, seed }).unwrap();
+            let (on, off) = match route.lanes()[1].0 {
+                2 => (2, 3),
+                _ => (3, 2),
+            };
+            let seen = lanes(Some(&route));
+            assert!(seen.contains(&(Some(1), true)) && seen.contains(&(Some(on), true)));
+            assert!(seen.iter().all(|(lane, _)| *lane != Some(off)), "{seen:?}");
+        }
     }
 
     #[test]
@@ -638,7 +699,7 @@ mod tests {
             let lights = Lights {
                 by_lane: vec![(gump_scene::LaneId(2), light, None)],
             };
-            look(&map, &lights, &agents, 0).is_free(&agents[0])
+            look(&map, &lights, &agents, 0, None).is_free(&agents[0])
         };
         let green = LightState::Green;
         assert!(is_free(8.0, &[], green));

@@ -31,7 +31,7 @@ const METRES_PER_RADIAN: f64 = 3.0;
 /// A lane this much worse than the best is not an alternative, metres.
 const ALTERNATIVE_M: f64 = 1.0;
 /// Length of a path ahead, metres: about three seconds at 20 m/s.
-const PATH_M: f64 = 64.0;
+pub(super) const PATH_M: f64 = 64.0;
 /// Number of distinct paths ahead: left, straight on, right.
 pub(super) const PATHS: usize = 3;
 /// Maximum number of paths from which the most different ones are chosen; bounds the time at forks.
@@ -64,7 +64,7 @@ pub struct Piece {
     pub(super) lane: Option<LaneId>,
     pub(super) starts_lane: bool,
     /// Length along the line, metres.
-    length: f64,
+    pub(super) length: f64,
     /// The pieces of lanes that follow.
     next: Vec<u32>,
 }
@@ -109,6 +109,8 @@ pub struct VectorMap {
     /// `[pieces, PIECE_NUMBERS]`
     pub numbers: Vec<f32>,
     cells: BTreeMap<(i64, i64), Vec<u32>>,
+    /// The pieces of each lane, in order.
+    by_lane: BTreeMap<LaneId, Vec<u32>>,
 }
 
 impl VectorMap {
@@ -217,7 +219,15 @@ impl VectorMap {
         for (i, piece) in self.pieces.iter().enumerate() {
             let cell = cell(piece.pose.position);
             self.cells.entry(cell).or_default().push(i as u32);
+            if let Some(lane) = piece.lane {
+                self.by_lane.entry(lane).or_default().push(i as u32);
+            }
         }
+    }
+
+    /// The pieces of a lane, from its start to its end.
+    pub(super) fn pieces_of(&self, lane: LaneId) -> &[u32] {
+        self.by_lane.get(&lane).map_or(&[], Vec::as_slice)
     }
 
     /// Pieces whose middle lies in a cell within `reach` metres of `point`.

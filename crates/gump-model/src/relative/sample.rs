@@ -14,6 +14,7 @@ use crate::relative::graph::{
 };
 use crate::relative::grid::{FIELDS, STILL_M, quantize};
 use crate::relative::map::{Hidden, PIECE_NUMBERS, VectorMap};
+use crate::relative::route::{Route, of_log};
 use crate::steps::stride_of;
 
 /// Settings of training samples.
@@ -42,6 +43,8 @@ pub struct SampleConfig {
     /// Probability that an agent is shown at a frame without its past: a network that always sees it
     /// learns to repeat it.
     pub forget: f64,
+    /// Probability that a vehicle is shown with its route, from the first frame on or a later one.
+    pub routes: f64,
 }
 
 impl Default for SampleConfig {
@@ -59,6 +62,7 @@ impl Default for SampleConfig {
             hide_size: 0.02,
             cut_tracks: 0.1,
             forget: 0.0,
+            routes: 0.0,
         }
     }
 }
@@ -74,6 +78,7 @@ impl SampleConfig {
             hide_size: 0.0,
             cut_tracks: 0.0,
             forget: 0.0,
+            routes: 0.0,
             ..Self::default()
         }
     }
@@ -159,8 +164,17 @@ pub struct Track {
     pub body: Body,
     /// By frame, where it is present.
     pub states: Vec<Option<State>>,
+    /// By frame, where it means to go, as far as that is told; empty if it never is.
+    pub routes: Vec<Option<Route>>,
     /// Whether it is an obstacle: it keeps its states, and there is nothing to learn from it.
     pub is_obstacle: bool,
+}
+
+impl Track {
+    /// Where it means to go at a frame, if that is told.
+    pub fn route(&self, t: usize) -> Option<&Route> {
+        self.routes.get(t)?.as_ref()
+    }
 }
 
 /// An agent at a frame.
@@ -282,9 +296,13 @@ pub fn draw(
         true => vec![Lights::default(); n_frames],
         false => lights(scenario, start, stride, n_frames),
     };
+    let routes = (config.routes, seed.fork(2));
+    tell_routes(&scenario.map, &mut tracks, routes);
     if let Some(driver) = driver {
         let place = (&*scenario.map, centre);
         driver.drive(place, &map, &lights, &mut tracks, seed.fork(0));
+        // Who was led away from the log may have gone another way.
+        tell_routes(&scenario.map, &mut tracks, routes);
     }
     let forget = (config.forget, seed.fork(1));
     Some(assemble(&map, &tracks, &lights, forget))
@@ -309,6 +327,30 @@ pub fn whole(
     let tracks: Vec<Track> = ids.iter().map(track).collect();
     let lights = lights(scenario, start, stride, n_frames);
     Some(assemble(map, &tracks, &lights, (0.0, Seed(0))))
+}
+
+/// Tells the routes of a share of the vehicles, half of them from the first frame on.
+fn tell_routes(map: &MapGraph, tracks: &mut [Track], (share, seed): (f64, Seed)) {
+    if share <= 0.0 {
+        return;
+    }
+    for (a, track) in tracks.iter_mut().enumerate() {
+        track.routes.clear();
+        let seed = seed.fork(a as u64);
+        let mut rng = seed.fork(0).rng();
+        let is_told = track.body.kind == AgentKind::Vehicle && !track.is_obstacle;
+        if !is_told || !rng.random_bool(share) {
+            continue;
+        }
+        let poses = track.states.iter().map(|state| Some((*state)?.logged));
+        let poses: Vec<Option<Pose>> = poses.collect();
+        let from = match rng.random_bool(0.5) {
+            true => 0,
+            false => rng.random_range(0..poses.len()),
+        };
+        track.routes = of_log(map, &poses, seed.fork(1));
+        track.routes[..from].fill(None);
+    }
 }
 
 /// The agents of a sample, and its centre.
@@ -400,6 +442,7 @@ fn track(
             sized,
         }),
         states,
+        routes: Vec::new(),
         is_obstacle: false,
     }
 }
@@ -514,7 +557,7 @@ fn assemble(
                 };
                 push(node, &past_edge(own, then, ago));
             }
-            let view = look(map, &lights[t], &agents, i);
+            let view = look(map, &lights[t], &agents, i, tracks[a].route(t));
             for (j, row) in &view.neighbours {
                 let node = node_of[t][present[*j]].expect("a neighbour is present");
                 push(node, row);
@@ -605,6 +648,37 @@ mod tests {
             nodes / 3 - 1,
             "the parked car, at every frame but the last"
         );
+    }
+
+    #[test]
+    fn told_vehicles_see_fewer_lanes_where_they_part() {
+        let scenario = fixture::scenario(
+            "lane 1: -60,0 60,0 speed 15 next 2,3
+             lane 2: 60,0 140,0
+             lane 3: 60,0 68,-2 70,-10 70,-80
+             ego vehicle 0: 20,0 velocity 8,0",
+        )
+        .unwrap();
+        let edges = |routes: f64| {
+            let config = SampleConfig {
+                routes,
+                ..SampleConfig::plain()
+            };
+            let all = (0..12).map(|seed| draw(&scenario, &config, None, Seed(seed)).unwrap());
+            let all = all.map(|sample| (sample.n_edges(), sample.targets.len()));
+            all.collect::<Vec<_>>()
+        };
+        let (never, always) = (edges(0.0), edges(1.0));
+        assert!(
+            never
+                .iter()
+                .zip(&always)
+                .all(|(n, a)| a.0 <= n.0 && a.1 == n.1)
+        );
+        // Half of them are told later than at the first frame.
+        let fewer = never.iter().zip(&always).filter(|(n, a)| a.0 < n.0).count();
+        assert!(fewer >= 6, "{fewer} of 12");
+        assert_eq!(edges(1.0), always);
     }
 
     #[test]

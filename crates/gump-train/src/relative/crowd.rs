@@ -157,6 +157,7 @@ impl Newcomer {
         Track {
             body: self.body,
             states: (0..n_frames).map(state).collect(),
+            routes: Vec::new(),
             is_obstacle: self.speed == 0.0,
         }
     }

@@ -27,6 +27,7 @@ use gump_model::local_context::LaneMap;
 use gump_model::relative::graph::{Lights, Shown, look};
 use gump_model::relative::grid::dequantize;
 use gump_model::relative::map::VectorMap;
+use gump_model::relative::route::{Route, Traveller};
 use gump_model::relative::sample::{Track, TrackDriver};
 use gump_model::relative::{RelativeNetwork, RelativeWeights};
 use gump_scene::{AgentKind, MapGraph, Seed};
@@ -70,6 +71,12 @@ const RULED: u64 = 1 << 32;
 const FAULT: usize = 1 << 16;
 /// Separates agents that are added to a sample from its draws.
 const CROWD: u64 = 1 << 33;
+
+/// Separates routes beyond the log from its draws.
+const ROUTE: u64 = 1 << 34;
+/// A vehicle that was led away from its log by more than this keeps the route that it has, metres: one
+/// into the lane beside it is nearer.
+const NEAR_ROUTE_M: f64 = 5.5;
 
 /// Settings of drives by the network in training.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -230,6 +237,10 @@ impl TrackDriver for NetworkDriver {
                         ));
                     }
                 }
+                if let Some(seen) = member {
+                    let route = told_route(streets, track.route(t), seen, seed.fork(ROUTE));
+                    seen.head_for(route);
+                }
             }
             let agents: Vec<Shown> = members.iter().flatten().map(ObservedAgent::now).collect();
             let mut read = Vec::new();
@@ -251,9 +262,9 @@ impl TrackDriver for NetworkDriver {
                     let log = [logs[a][t], logs[a][t + 1]];
                     now.body.kind == AgentKind::Vehicle && is_queued(now.pose, log, &lines)
                 };
-                let has_room = |i: usize| look(map, lights, &agents, i).has_room(&agents[i]);
+                let has_room = |i: usize| look(map, lights, &agents, i, None).has_room(&agents[i]);
                 let ways = |now: &Shown| match now.body.kind {
-                    AgentKind::Vehicle | AgentKind::Bicycle => courses(streets, lights, now),
+                    AgentKind::Vehicle | AgentKind::Bicycle => courses(streets, lights, now, None),
                     _ => Vec::new(),
                 };
                 let ways: Vec<Vec<Course>> = agents.iter().map(ways).collect();
@@ -393,6 +404,24 @@ impl NetworkDriver {
         });
         candidates.collect()
     }
+}
+
+/// The route of a vehicle: that of its log, as long as it is near it, else the one it has.
+fn told_route(
+    streets: &MapGraph,
+    logged: Option<&Route>,
+    seen: &ObservedAgent,
+    seed: Seed,
+) -> Option<Route> {
+    let now = seen.now();
+    let is_near = |route: &&Route| route.offset_m(streets, now.pose) < NEAR_ROUTE_M;
+    let who = Traveller {
+        pose: now.pose,
+        speed: now.velocity().length(),
+        seed,
+    };
+    let kept = || seen.route()?.from_there(streets, who);
+    logged.filter(is_near).cloned().or_else(kept)
 }
 
 /// Whether a vehicle stands beside the lanes throughout its log.

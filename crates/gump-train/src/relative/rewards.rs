@@ -54,8 +54,13 @@ impl Judged {
         network: &RelativeNetwork,
         config: &RelativeRewards,
     ) -> Result<Self, TrainError> {
+        // Moves are judged as the network evaluates them, which is without routes.
+        let sampling = RelativeSampling {
+            routes: false,
+            ..RelativeSampling::default()
+        };
         Ok(Self {
-            world: RelativeWorld::new(network, RelativeSampling::default())?,
+            world: RelativeWorld::new(network, sampling)?,
             config: config.clone(),
             metric: Config::of(Year::Y2025),
         })

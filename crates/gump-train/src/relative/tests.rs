@@ -433,6 +433,7 @@ fn tracks(scenario: &Scenario) -> Vec<Track> {
                 sized: true,
             },
             states: states.collect(),
+            routes: Vec::new(),
             is_obstacle: false,
         }
     };

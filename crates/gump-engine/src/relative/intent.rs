@@ -1,0 +1,195 @@
+//! Where vehicles mean to go in a rollout: drawn once, and kept.
+
+use gump_model::relative::graph::Shown;
+use gump_model::relative::route::{Route, Traveller};
+use gump_model::steps::TOKEN_DT;
+use gump_scene::{AgentKind, Lane, MapGraph, Seed};
+
+use crate::nucleus::uniform;
+
+// All were chosen by hand.
+
+/// Changes of lane that a vehicle decides on, per minute of driving where one is possible.
+const CHANGES_PER_MINUTE: f64 = 1.0;
+/// Slower vehicles decide on none, metres per second, ...
+const FAST_MPS: f64 = 3.0;
+/// ... nor those with less of the lane ahead, metres: who is about to turn has chosen the lane.
+const ROOM_M: f64 = 30.0;
+/// The other lane is this far from a vehicle's centre, metres.
+const BESIDE_M: (f64, f64) = (2.0, 5.0);
+/// A change ends this near to the lane, metres, a radian counting as three, ...
+const THERE_M: f64 = 0.6;
+/// ... and is given up after so long, seconds: more than the five of training.
+const GIVES_UP_S: f64 = 8.0;
+/// Separates decisions to change lane from those where lanes part.
+const CHANGES: u64 = 1 << 32;
+
+/// Where a vehicle means to go.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Intent {
+    route: Option<Route>,
+    /// Time since it decided to change lane, seconds, until it is there.
+    changing_s: Option<f64>,
+}
+
+impl Intent {
+    /// The route that the network is told.
+    pub(super) fn route(&self) -> Option<&Route> {
+        self.route.as_ref()
+    }
+
+    /// Half a second later. `seed` is the agent's own, `frame` the index of the frame.
+    pub(super) fn go_on(&mut self, map: &MapGraph, now: &Shown, seed: Seed, frame: usize) {
+        if now.body.kind != AgentKind::Vehicle {
+            return;
+        }
+        let who = Traveller {
+            pose: now.pose,
+            speed: now.velocity().length(),
+            seed,
+        };
+        let stands = who.speed == 0.0;
+        if stands && self.route.is_some() {
+            return;
+        }
+        self.route = self
+            .route
+            .as_ref()
+            .and_then(|route| route.from_there(map, who));
+        if let (Some(route), Some(since)) = (&self.route, self.changing_s) {
+            self.changing_s = match route.offset_m(map, now.pose) {
+                offset if offset < THERE_M => None,
+                _ if since > GIVES_UP_S => {
+                    self.route = None;
+                    None
+                }
+                _ => Some(since + TOKEN_DT),
+            };
+        }
+        if self.route.is_none() {
+            self.changing_s = None;
+            self.route = Route::from_here(map, who);
+        }
+        if self.changing_s.is_none() {
+            self.decide_on_a_change(map, who, frame);
+        }
+    }
+
+    fn decide_on_a_change(&mut self, map: &MapGraph, who: Traveller, frame: usize) {
+        let stream = who.seed.fork(CHANGES).fork(frame as u64);
+        let rate = CHANGES_PER_MINUTE / 60.0 * TOKEN_DT;
+        if uniform(stream) >= rate || who.speed < FAST_MPS {
+            return;
+        }
+        let here = self.route.as_ref().and_then(|route| route.lanes().first());
+        let Some(here) = here.and_then(|id| map.lane(*id)) else {
+            return;
+        };
+        let at = here.centerline.project(who.pose.position).arc_length;
+        if here.in_intersection || here.centerline.length() - at < ROOM_M {
+            return;
+        }
+        let is_beside = |lane: &&Lane| {
+            let distance = lane.centerline.project(who.pose.position).distance;
+            !lane.in_intersection && (BESIDE_M.0..BESIDE_M.1).contains(&distance)
+        };
+        let sides = [&here.left_neighbors, &here.right_neighbors];
+        let beside = sides.map(|side| {
+            let mut lanes = side.iter().filter_map(|id| map.lane(*id));
+            lanes.find(is_beside)
+        });
+        let beside: Vec<&Lane> = beside.into_iter().flatten().collect();
+        if beside.is_empty() {
+            return;
+        }
+        let n = beside.len();
+        let which = (uniform(stream.fork(1)) * n as f64) as usize;
+        let lane = beside[which.min(n - 1)].id;
+        self.route = Some(Route::into_lane(map, lane, who));
+        self.changing_s = Some(0.0);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use gump_geometry::{DVec2, Pose};
+    use gump_model::relative::graph::Body;
+    use gump_scene::{LaneId, Scenario};
+
+    use super::*;
+
+    fn scenario() -> Scenario {
+        gump_scene::fixture::scenario(
+            "lane 1: 0,0 3000,0 speed 15 left 2
+             lane 2: 0,3.5 3000,3.5 speed 15 right 1
+             ego vehicle 0: 10,0 velocity 8,0",
+        )
+        .unwrap()
+    }
+
+    fn car(pose: Pose, speed: f64) -> Shown {
+        let body = Body {
+            kind: AgentKind::Vehicle,
+            length: 4.5,
+            width: 1.9,
+            sized: true,
+        };
+        Shown::first(body, pose, DVec2::new(speed, 0.0))
+    }
+
+    #[test]
+    fn a_change_of_lane_is_decided_on_now_and_then_and_kept_until_it_is_done() {
+        let map = &scenario().map;
+        let (mut decided, mut driven) = (0, 0);
+        for agent in 0..60 {
+            let seed = Seed(agent);
+            let mut intent = Intent::default();
+            for frame in 0..120 {
+                driven += 1;
+                let mut x = 10.0 + 4.0 * f64::from(frame);
+                intent.go_on(map, &car(Pose::new(x, 0.0, 0.0), 8.0), seed, frame as usize);
+                if intent.changing_s.is_none() {
+                    assert_eq!(intent.route().unwrap().lanes(), [LaneId(1)]);
+                    continue;
+                }
+                decided += 1;
+                assert_eq!(intent.route().unwrap().lanes(), [LaneId(2)]);
+                // On the way over it stays decided, and there it is not any more.
+                x += 4.0;
+                intent.go_on(map, &car(Pose::new(x, 1.5, 0.1), 8.0), seed, 200);
+                assert!(intent.changing_s.is_some());
+                intent.go_on(map, &car(Pose::new(x + 4.0, 3.4, 0.0), 8.0), seed, 201);
+                assert!(intent.changing_s.is_none());
+                assert_eq!(intent.route().unwrap().lanes(), [LaneId(2)]);
+                break;
+            }
+        }
+        let rate = f64::from(decided) / (f64::from(driven) * TOKEN_DT / 60.0);
+        assert!((0.6..1.5).contains(&rate), "{rate} a minute");
+    }
+
+    #[test]
+    fn who_does_not_get_over_gives_up_and_who_stands_does_not_decide() {
+        let map = &scenario().map;
+        let here = Pose::new(50.0, 0.0, 0.0);
+        let who = Traveller {
+            pose: here,
+            speed: 8.0,
+            seed: Seed(1),
+        };
+        let mut intent = Intent {
+            route: Some(Route::into_lane(map, LaneId(2), who)),
+            changing_s: Some(0.0),
+        };
+        for frame in 0..18 {
+            let x = 50.0 + 4.0 * f64::from(frame);
+            intent.go_on(map, &car(Pose::new(x, 0.0, 0.0), 8.0), Seed(1), 0);
+        }
+        assert!(intent.changing_s.is_none());
+        assert_eq!(intent.route().unwrap().lanes(), [LaneId(1)]);
+        for frame in 0..5000 {
+            intent.go_on(map, &car(here, 0.0), Seed(1), frame);
+        }
+        assert_eq!(intent.route().unwrap().lanes(), [LaneId(1)]);
+    }
+}
