@@ -52,10 +52,12 @@ impl Intent {
         if stands && self.route.is_some() {
             return;
         }
+        let changes = self.changing_s.is_some();
         self.route = self
             .route
             .as_ref()
-            .and_then(|route| route.from_there(map, who));
+            .and_then(|route| route.from_there(map, who, changes))
+            .filter(|route| !route.is_missed(map, who));
         if let (Some(route), Some(since)) = (&self.route, self.changing_s) {
             self.changing_s = match route.offset_m(map, now.pose) {
                 offset if offset < THERE_M => None,

@@ -33,8 +33,12 @@ const FORESEEN: usize = 10;
 const AHEAD_M: f64 = 90.0;
 /// Maximum number of lanes of a route; bounds the time where lanes are short.
 const MOST_LANES: usize = 40;
-/// A vehicle this far from all lanes of its route has lost it, metres; a radian counts as above.
-const LOST_M: f64 = 5.0;
+/// A vehicle this far from all lanes of its route has lost it, metres; a radian counts as above. On the way
+/// to the lane beside it the second number holds.
+const LOST_M: f64 = 3.0;
+const LOST_BESIDE_M: f64 = 5.5;
+/// A vehicle that would have to brake harder than this for a turn of its route does not take it, m/s².
+const HARDEST_MPS2: f64 = 4.0;
 /// Where lanes part, directions are those of a place so far ahead, metres. The lane that leads straightest
 /// on and those within this angle of it are the way on, radians, if they turn by no more than the second
 /// angle.
@@ -121,8 +125,8 @@ impl Route {
     }
 
     /// The same route from the lane on that the vehicle has come to, as long as before; `None` if it has
-    /// lost it.
-    pub fn from_there(&self, map: &MapGraph, who: Traveller) -> Option<Self> {
+    /// lost it, from which one that changes lane is farther.
+    pub fn from_there(&self, map: &MapGraph, who: Traveller, changes_lane: bool) -> Option<Self> {
         let lanes = self.lanes.iter().enumerate();
         let lanes = lanes.filter_map(|(i, id)| {
             let lane = map.lane(*id)?;
@@ -130,7 +134,32 @@ impl Route {
             Some((cost(lane, distance, who.pose), i))
         });
         let (least, at) = lanes.min_by(|a, b| a.0.total_cmp(&b.0))?;
-        (least < LOST_M).then(|| Self::extended(map, self.lanes[at..].to_vec(), who))
+        let lost = if changes_lane { LOST_BESIDE_M } else { LOST_M };
+        (least < lost).then(|| Self::extended(map, self.lanes[at..].to_vec(), who))
+    }
+
+    /// Whether a vehicle is too fast for a turn that it could have passed by.
+    pub fn is_missed(&self, map: &MapGraph, who: Traveller) -> bool {
+        let lanes: Vec<&Lane> = self.lanes.iter().filter_map(|id| map.lane(*id)).collect();
+        let Some(first) = lanes.first() else {
+            return false;
+        };
+        let at = first.centerline.project(who.pose.position).arc_length;
+        let mut ahead = first.centerline.length() - at;
+        for pair in lanes.windows(2) {
+            if who.speed * who.speed <= 2.0 * HARDEST_MPS2 * ahead {
+                return false;
+            }
+            if pair[0].successors.len() > 1 {
+                let there = bend_speed(map, pair[1], 0.0, BENDS);
+                let squared = there * there + 2.0 * HARDEST_MPS2 * ahead;
+                if who.speed * who.speed > squared {
+                    return true;
+                }
+            }
+            ahead += pair[1].centerline.length();
+        }
+        false
     }
 
     /// How far a vehicle is from the route, metres; a difference of direction counts as well.
@@ -446,19 +475,21 @@ mod tests {
         assert_eq!(route.lanes()[0], LaneId(1));
         let later = Pose::new(99.0, 0.3, 0.0);
         // Another seed does not change what is decided.
-        let kept = route.from_there(map, slow(later, 4)).unwrap();
+        let kept = route.from_there(map, slow(later, 4), false).unwrap();
         assert_eq!(kept.lanes()[..2], route.lanes()[..2]);
         assert!(
             route
-                .from_there(map, slow(Pose::new(60.0, 9.0, 0.0), 4))
+                .from_there(map, slow(Pose::new(60.0, 9.0, 0.0), 4), true)
                 .is_none()
         );
         assert!(
             route
-                .from_there(map, slow(Pose::new(60.0, 0.0, 3.1), 4))
+                .from_there(map, slow(Pose::new(60.0, 0.0, 3.1), 4), true)
                 .is_none()
         );
         let beside = Route::into_lane(map, LaneId(2), slow(here, 3));
+        assert!(beside.from_there(map, slow(here, 3), true).is_some());
+        assert!(beside.from_there(map, slow(here, 3), false).is_none());
         assert_eq!(beside.lanes(), [LaneId(2), LaneId(5)]);
         assert!((beside.offset_m(map, here) - 3.2).abs() < 1e-9);
         let vector_map = VectorMap::new(map, here.position, 300.0, Default::default());
@@ -469,6 +500,23 @@ mod tests {
             "{ends:?}"
         );
         assert!(ends.windows(2).all(|pair| pair[0] < pair[1]));
+    }
+
+    #[test]
+    fn who_comes_too_fast_misses_the_turn() {
+        let map = &scenario().map;
+        let here = Pose::new(40.0, 0.0, 0.0);
+        let routes = (0..60).filter_map(|seed| Route::from_here(map, slow(here, seed)));
+        let routes: Vec<Route> = routes.collect();
+        let misses = |turns: bool, x: f64, speed: f64| {
+            let turn = |route: &&Route| route.lanes().contains(&LaneId(4)) == turns;
+            let route = routes.iter().find(turn).unwrap();
+            let pose = Pose::new(x, 0.0, 0.0);
+            let seed = Seed(1);
+            route.is_missed(map, Traveller { pose, speed, seed })
+        };
+        assert!(misses(true, 92.0, 14.0) && !misses(false, 92.0, 14.0));
+        assert!(!misses(true, 92.0, 6.0) && !misses(true, 50.0, 14.0));
     }
 
     #[test]

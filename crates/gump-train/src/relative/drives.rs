@@ -420,7 +420,7 @@ fn told_route(
         speed: now.velocity().length(),
         seed,
     };
-    let kept = || seen.route()?.from_there(streets, who);
+    let kept = || seen.route()?.from_there(streets, who, true);
     logged.filter(is_near).cloned().or_else(kept)
 }
 
