@@ -24,7 +24,7 @@ fn fork() -> Scenario {
          lane 5: 30,0 120,0 speed 13
          lane 6: 15,15 15,100 speed 13
          lane 7: 11.5,-11 11.5,-100 speed 13
-         ego vehicle 0: -32,0 velocity 8,0",
+         ego vehicle 0: -32,0 velocity 6,0",
     )
     .unwrap()
 }
