@@ -1,3 +1,5 @@
+//! Futures of the shipped weights: routes.
+
 use gump_model::relative::route::Route;
 use gump_scene::{LaneId, Scenario, fixture};
 
