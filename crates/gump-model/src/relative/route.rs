@@ -59,7 +59,8 @@ const BENDS: BendLimits = BendLimits {
     ahead_m: 30.0,
 };
 
-/// Lanes that a vehicle means to follow, in order.
+/// Lanes that a vehicle means to follow, in order. A [`gump_scene::Route`] is that of a scenario's ego,
+/// stated by its file; this one is determined or drawn for any vehicle, and goes on with it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Route {
     lanes: Arc<[LaneId]>,

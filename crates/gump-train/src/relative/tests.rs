@@ -93,6 +93,36 @@ fn a_deeper_network_goes_on_from_what_it_said() {
 }
 
 #[test]
+fn probabilities_of_samples_are_checked() {
+    let wrong = |sample: SampleConfig| {
+        let config = RelativeTrainConfig {
+            sample,
+            ..RelativeTrainConfig::default()
+        };
+        config.validate().map_err(|error| error.to_string())
+    };
+    let routes = |routes: f64| {
+        wrong(SampleConfig {
+            routes,
+            ..SampleConfig::default()
+        })
+    };
+    assert!(routes(0.0).is_ok() && routes(1.0).is_ok());
+    for value in [-0.1, 1.5, f64::NAN] {
+        let why = routes(value).unwrap_err();
+        assert!(
+            why.contains("sample.routes must be between 0 and 1"),
+            "{why}"
+        );
+    }
+    let forget = wrong(SampleConfig {
+        forget: 2.0,
+        ..SampleConfig::default()
+    });
+    assert!(forget.unwrap_err().contains("sample.forget"));
+}
+
+#[test]
 fn a_gradient_without_end_changes_nothing() {
     let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
     let parameters = network.parameters();

@@ -99,6 +99,26 @@ impl RelativeTrainConfig {
                 reason: "batch and steps must be at least 1".into(),
             });
         }
+        let sample = &self.sample;
+        let probabilities = [
+            ("sample.perturbed", sample.perturbed),
+            ("sample.hide_limits", sample.hide_limits),
+            ("sample.hide_stop_signs", sample.hide_stop_signs),
+            ("sample.hide_lights", sample.hide_lights),
+            ("sample.hide_size", sample.hide_size),
+            ("sample.cut_tracks", sample.cut_tracks),
+            ("sample.forget", sample.forget),
+            ("sample.routes", sample.routes),
+        ];
+        let wrong = probabilities
+            .iter()
+            .find(|(_, value)| !(0.0..=1.0).contains(value));
+        if let Some((key, value)) = wrong {
+            return Err(TrainError::Config {
+                key,
+                reason: format!("{key} must be between 0 and 1, found {value}"),
+            });
+        }
         self.closed_loop
             .as_ref()
             .map_or(Ok(()), RelativeDrives::validate)?;
