@@ -9,7 +9,7 @@ use std::str::FromStr;
 
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use gump_data::OutputFormat;
-use gump_engine::{CacheMode, LightSource, Mode, Precision};
+use gump_engine::{CacheMode, LightSource, Mode, Precision, Routes};
 use gump_generate::Placement;
 use gump_nuplan::closed_loop::Tracking;
 use gump_planner::{Aggregate, Allocation, WarmStart};
@@ -48,6 +48,13 @@ pub(crate) const LIGHTS: [(LightSource, &str); 3] = [
     (LightSource::Model, "Simulated signal phases"),
     (LightSource::Hold, "As at the present"),
     (LightSource::Log, "As recorded (uses the future)"),
+];
+
+/// When vehicles are given routes.
+pub(crate) const ROUTES: [(Routes, &str); 3] = [
+    (Routes::Never, "The network decides every half second"),
+    (Routes::Late, "After nine seconds"),
+    (Routes::Always, "From the second step on"),
 ];
 
 /// Distributions of rollouts over candidates.
@@ -178,6 +185,7 @@ mod tests {
         check(&CACHES, &CacheMode::ALL);
         check(&PRECISIONS, &Precision::ALL);
         check(&LIGHTS, &LightSource::ALL);
+        check(&ROUTES, &Routes::ALL);
         check(&ALLOCATIONS, &Allocation::ALL);
         check(&WARM_STARTS, &WarmStart::ALL);
         check(&AGGREGATES, &Aggregate::ALL);

@@ -1,11 +1,11 @@
 //! Flags of a learned world's decoding.
 
-use gump_engine::{CacheMode, LightSource, Mode, Precision, SamplingConfig};
+use gump_engine::{CacheMode, LightSource, Mode, Precision, Routes, SamplingConfig};
 use gump_eval::decoding::Decoding;
 use gump_eval::worlds::WorldName;
 use serde::Serialize;
 
-use crate::choices::{CACHES, LIGHTS, MODES, PRECISIONS, one_of};
+use crate::choices::{CACHES, LIGHTS, MODES, PRECISIONS, ROUTES, one_of};
 use crate::cli::WrongArguments;
 
 /// Flags of a learned world's decoding.
@@ -47,9 +47,9 @@ pub(crate) struct Draw {
     /// No kinematic limits: vehicles and bicycles may turn on the spot, slip sideways and stop at once
     #[arg(long)]
     no_limits: bool,
-    /// Give the vehicles of a relative network routes, which they keep
-    #[arg(long)]
-    routes: bool,
+    /// When the vehicles of a relative network are given routes, which they keep
+    #[arg(long, value_name = "WHEN", value_parser = one_of(ROUTES), default_value_t = Routes::Late)]
+    routes: Routes,
     /// The network alone: no rejection sampling, no kinematic limits
     #[arg(long)]
     raw: bool,
@@ -125,7 +125,7 @@ impl Draw {
             decay: self.decay.unwrap_or(base.decay),
             redraws: self.redraws.unwrap_or(base.redraws),
             limits: base.limits && !self.no_limits,
-            routes: base.routes || self.routes,
+            routes: self.routes,
             ..base
         };
         let absurd = |t: &f64| !(*t > 0.0 && t.is_finite());
@@ -221,7 +221,7 @@ mod tests {
             decay: None,
             redraws: None,
             no_limits: false,
-            routes: false,
+            routes: Routes::Late,
             raw: false,
             paper: false,
             ruled: false,

@@ -90,7 +90,7 @@ pub mod world;
 pub use error::EngineError;
 pub use gump_kernels::panels::Precision;
 pub use gump_rollout::{PredictiveSamples, ProbeConfig};
-pub use sampling::{CacheMode, LightSource, Mode, RateScale, SamplingConfig, Surrogate};
+pub use sampling::{CacheMode, LightSource, Mode, RateScale, Routes, SamplingConfig, Surrogate};
 #[cfg(feature = "tensors")]
 pub use trajectories::{AgentTrajectories, TrajectoryMode};
 #[cfg(feature = "tensors")]

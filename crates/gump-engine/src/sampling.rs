@@ -52,9 +52,9 @@ pub struct SamplingConfig {
     pub yields_to_driven: bool,
     /// Whether kinematic limits apply to vehicles and bicycles (paper: no).
     pub limits: bool,
-    /// Whether the vehicles of a relative network are given routes, which they keep; the sequence network
+    /// When the vehicles of a relative network are given routes, which they keep; the sequence network
     /// has none.
-    pub routes: bool,
+    pub routes: Routes,
     /// The form in which the weights are multiplied (on a CPU; other devices compute as trained).
     pub precision: Precision,
 }
@@ -78,7 +78,7 @@ impl Default for SamplingConfig {
             redraws: 12,
             yields_to_driven: true,
             limits: true,
-            routes: false,
+            routes: Routes::default(),
             precision: Precision::F32,
         }
     }
@@ -171,6 +171,43 @@ impl fmt::Display for LightSource {
 }
 
 impl FromStr for LightSource {
+    type Err = NameError;
+
+    /// Finds a value by the name that it is stored and displayed under.
+    ///
+    /// # Errors
+    /// A sentence with the unknown name and the known ones.
+    fn from_str(name: &str) -> Result<Self, NameError> {
+        Self::deserialize(name.into_deserializer())
+    }
+}
+
+/// When vehicles are given routes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+#[non_exhaustive]
+pub enum Routes {
+    /// Never: the network decides every half second where to go.
+    Never,
+    /// After nine seconds: until then the network knows better than the frequencies of turns.
+    #[default]
+    Late,
+    /// From the second step on.
+    Always,
+}
+
+impl Routes {
+    /// All of them, in the order of declaration.
+    pub const ALL: [Self; 3] = [Self::Never, Self::Late, Self::Always];
+}
+
+impl fmt::Display for Routes {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.serialize(f)
+    }
+}
+
+impl FromStr for Routes {
     type Err = NameError;
 
     /// Finds a value by the name that it is stored and displayed under.
@@ -307,7 +344,7 @@ mod tests {
             redraws: 0,
             yields_to_driven: true,
             limits: false,
-            routes: false,
+            routes: Routes::Late,
             precision: Precision::F32,
         };
         assert_eq!(SamplingConfig::raw(), raw);

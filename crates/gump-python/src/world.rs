@@ -6,7 +6,7 @@ use std::str::FromStr;
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use gump_engine::{LightSource, Mode, Precision, SamplingConfig, TransformerWorld};
+use gump_engine::{LightSource, Mode, Precision, Routes, SamplingConfig, TransformerWorld};
 use gump_eval::worlds::{self, WorldName};
 use gump_geometry::{Pose, dvec2};
 use gump_model::Device;
@@ -58,6 +58,7 @@ struct Sampling {
     paper: bool,
     spawn: bool,
     lights: String,
+    routes: String,
     precision: String,
 }
 
@@ -82,6 +83,7 @@ impl Sampling {
                 "lights",
                 &self.lights,
             )?,
+            routes: one_of(&Routes::ALL, "routes", &self.routes)?,
             temperature: self.temperature.or(base.temperature),
             top_k: self.top_k.unwrap_or(base.top_k),
             top_p: self.top_p.or(base.top_p),

@@ -39,7 +39,7 @@ use crate::relative::rules::{
 };
 use crate::relative::seen::{FrameIndex, ObservedAgent, add_presents};
 use crate::relative::waiting::{Standing, free_to_go};
-use crate::sampling::SamplingConfig;
+use crate::sampling::{Routes, SamplingConfig};
 
 pub use live::LiveFuture;
 
@@ -68,7 +68,8 @@ const CREEPS: f64 = 0.5;
 /// log (result 23).
 const START: f64 = 1.0;
 /// After as many steps, nine seconds, vehicles without a reason to slow down are shown without
-/// their past: see [`View::is_free`](gump_model::relative::graph::View::is_free).
+/// their past (see [`View::is_free`](gump_model::relative::graph::View::is_free)), and are given
+/// routes.
 const LATE: usize = 18;
 /// An agent that was faster than this is not parked, metres per second: more than the jitter of
 /// recorded boxes. Chosen by hand (decision 26).
@@ -116,8 +117,8 @@ pub struct RelativeSampling {
     pub yields_to_driven: bool,
     /// Whether vehicles and bicycles are prevented from turning in place and slipping sideways.
     pub limits: bool,
-    /// Whether vehicles are given routes, which they keep.
-    pub routes: bool,
+    /// When vehicles are given routes, which they keep.
+    pub routes: Routes,
     /// The form in which the weights are multiplied.
     pub precision: Precision,
 }
@@ -130,7 +131,7 @@ impl Default for RelativeSampling {
             redraws: 0,
             yields_to_driven: true,
             limits: false,
-            routes: false,
+            routes: Routes::default(),
             precision: Precision::F32,
         }
     }
@@ -299,8 +300,8 @@ pub(super) struct Scene {
     ego: AgentId,
     /// The lights that it may show.
     lights: Vec<Light>,
-    /// Whether vehicles are given routes.
-    has_routes: bool,
+    /// When vehicles are given routes.
+    routes: Routes,
 }
 
 impl Scene {
@@ -336,7 +337,7 @@ impl Scene {
             centres,
             ego,
             lights: lights.to_vec(),
-            has_routes: sampling.routes,
+            routes: sampling.routes,
         }
     }
 }
@@ -455,12 +456,13 @@ impl Future {
     fn read_all(futures: &mut [Self], engine: &RelativeEngine, room: &mut Workspace) {
         let mut presents = Vec::new();
         for future in &mut *futures {
+            let is_late = future.is_late();
             let (scene, lights) = (&future.scene, &future.shown_lights);
             let seen = future.members.iter_mut().map(|member| &mut member.seen);
             let map = (&scene.map, &scene.memory);
             let frame = FrameIndex {
                 t: future.frames,
-                is_late: future.frames >= future.history + LATE,
+                is_late,
             };
             add_presents(map, lights, seen, frame, &mut presents);
         }
@@ -475,6 +477,11 @@ impl Future {
             future.frames += 1;
             rows = rest;
         }
+    }
+
+    /// Whether it is longer than benchmarks show.
+    fn is_late(&self) -> bool {
+        self.frames >= self.history + LATE
     }
 
     /// Lets it read the present again, after others have come or gone.
@@ -560,7 +567,12 @@ impl Future {
                 member.agent.state = driven;
             }
         }
-        if self.scene.has_routes {
+        let has_routes = match self.scene.routes {
+            Routes::Never => false,
+            Routes::Late => self.is_late(),
+            Routes::Always => true,
+        };
+        if has_routes {
             self.choose_ways(ego.map(|_| id));
         }
         for other in &mut self.others {

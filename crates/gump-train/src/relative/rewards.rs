@@ -8,6 +8,7 @@
 //! step: the return of a move is the sum of later rewards. Moves with a higher return than those of
 //! the other futures become more likely, the others less likely.
 
+use gump_engine::Routes;
 use gump_engine::relative::{MAP_M, RelativeSampling, RelativeWorld};
 use gump_model::relative::RelativeNetwork;
 use gump_model::relative::map::{Hidden, VectorMap};
@@ -56,7 +57,7 @@ impl Judged {
     ) -> Result<Self, TrainError> {
         // Moves are judged as the network evaluates them, which is without routes.
         let sampling = RelativeSampling {
-            routes: false,
+            routes: Routes::Never,
             ..RelativeSampling::default()
         };
         Ok(Self {

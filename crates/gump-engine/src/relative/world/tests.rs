@@ -5,7 +5,7 @@ use gump_scene::{LaneId, Scenario, fixture};
 
 use super::*;
 
-fn world(routes: bool) -> RelativeWorld {
+fn world(routes: Routes) -> RelativeWorld {
     let path = "../../datasets/weights/gump-relative.safetensors";
     let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join(path);
     let weights = RelativeWeights::read(&std::fs::read(path).unwrap()).unwrap();
@@ -58,7 +58,7 @@ fn future(
 
 #[test]
 fn vehicles_follow_their_routes() {
-    let (world, scenario) = (world(true), fork());
+    let (world, scenario) = (world(Routes::Always), fork());
     let mut followed = [(0, 0); 2];
     for seed in 0..64 {
         let (future, meant) = future(&world, &scenario, seed, 18);
@@ -75,7 +75,7 @@ fn vehicles_follow_their_routes() {
 
 #[test]
 fn without_routes_there_are_none() {
-    let (future, meant) = future(&world(false), &fork(), 1, 6);
+    let (future, meant) = future(&world(Routes::Never), &fork(), 1, 6);
     assert_eq!(meant, None);
     assert_eq!(future.members[0].intent.route(), None);
 }
