@@ -200,23 +200,31 @@ pub(super) struct Shut<'l> {
     most: Vec<f64>,
 }
 
+/// What is known of an agent beside what it shows.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Known<'r> {
+    /// Nobody waits for it.
+    pub(super) is_unheeded: bool,
+    /// It closes no junction, and nobody has to let it pass.
+    pub(super) is_parked: bool,
+    /// It lets everybody pass.
+    pub(super) stands_back: bool,
+    /// Where it means to go.
+    pub(super) route: Option<&'r Route>,
+}
+
 impl<'l> Shut<'l> {
-    /// For agents with these lights, which show these colours. `unheeded` is one for which nobody waits;
-    /// `is_parked` says who closes no junction, `route` where vehicles mean to go, if that is known.
-    pub(super) fn of<'r>(
+    /// For agents with these lights, which show these colours.
+    pub(super) fn of(
         map: &MapGraph,
         agents: &[Shown],
-        (unheeded, is_parked, route): (
-            Option<usize>,
-            impl Fn(usize) -> bool,
-            impl Fn(usize) -> Option<&'r Route>,
-        ),
+        known: &[Known<'_>],
         lights: impl Iterator<Item = (&'l StopLine, LightState)>,
         colours: &Lights,
     ) -> Self {
         let is_lit = |lane| colours.colour(lane).is_some();
-        let counts = |i: usize| unheeded != Some(i);
-        let closes = |i: usize| counts(i) && !is_parked(i);
+        let closes = |i: usize| !known[i].is_unheeded && !known[i].is_parked;
+        let comes = |i: usize| !known[i].is_unheeded && !known[i].stands_back;
         let entry = |i: usize| {
             let speed = agents[i].velocity().length();
             let stop = speed * speed / (2.0 * GENTLY) + speed * TOKEN_DT;
@@ -225,15 +233,15 @@ impl<'l> Shut<'l> {
             Some(StopLine::at_end(lane))
         };
         let ways = |i: usize| match agents[i].body.kind {
-            AgentKind::Vehicle | AgentKind::Bicycle if counts(i) => {
-                courses(map, colours, &agents[i], route(i))
+            AgentKind::Vehicle | AgentKind::Bicycle if comes(i) => {
+                courses(map, colours, &agents[i], known[i].route)
             }
             _ => Vec::new(),
         };
         let ways: Vec<Vec<Course>> = (0..agents.len()).map(ways).collect();
         let most = |i: usize| {
             let others = ways.iter().enumerate();
-            let others = others.filter(|(j, _)| *j != i && !is_parked(*j));
+            let others = others.filter(|(j, _)| *j != i && !known[*j].is_parked);
             let yielding = yielding_speed(&ways[i], &others.map(|(_, way)| &way[..]));
             yielding.min(speed_for_signs(&ways[i]))
         };
@@ -575,7 +583,13 @@ mod tests {
             let shut = Shut::of(
                 &map,
                 &agents,
-                (None, |_| is_parked, |_| None),
+                &[
+                    Known::default(),
+                    Known {
+                        is_parked,
+                        ..Known::default()
+                    },
+                ],
                 std::iter::empty(),
                 &Lights::default(),
             );

@@ -64,6 +64,11 @@ const MOVES: f64 = 0.5;
 /// In a junction patience is at most this, seconds, longer than a benchmark of 8 s shows: who stands
 /// there stands in the way. Vehicles that hold each other there squeeze past at once.
 const INSIDE_S: f64 = 9.0;
+/// One that does not squeeze past by then backs up, seconds, ...
+const STUCK_S: f64 = 12.0;
+/// ... if there is so much room behind it, and so much beside that, metres.
+const BEHIND_M: f64 = 3.0;
+const BESIDE_IT_M: f64 = 0.3;
 /// Agents that wait for each other are within this, metres, and meet at more than this angle,
 /// radians.
 const MEETING_M: f64 = 25.0;
@@ -91,21 +96,32 @@ struct Room {
     returns: bool,
 }
 
-/// Returns the indices of the agents that have stood for longer than their patience and could go on.
+/// What those may do who have stood for longer than their patience, by index.
+#[derive(Debug, Default, PartialEq, Eq)]
+pub(super) struct Released {
+    /// They could go on.
+    pub(super) go: Vec<usize>,
+    /// They stand in the way of others in a junction, as these in theirs, and have room to back up; with
+    /// each these others.
+    pub(super) back_up: Vec<(usize, Vec<usize>)>,
+}
+
+/// Returns the agents that have stood for longer than their patience and could go on, or back up.
 ///
 /// A vehicle or bicycle in a lane could if no agent is on the path ahead or about to cross it, no
 /// light forbids it, and of those whose paths meet there it has waited longest. After twice the time,
 /// in a junction at once, less room suffices between vehicles that stand across each other's paths.
+/// In a junction, where even that is missing for [`STUCK_S`], the vehicle that came last backs up.
 /// A pedestrian could if it stands on the path of a vehicle or bicycle that has waited as long.
 /// `agents` are all of the frame.
-pub(super) fn free_to_go(map: &MapGraph, lights: &[Light], agents: &[Standing]) -> Vec<usize> {
+pub(super) fn released(map: &MapGraph, lights: &[Light], agents: &[Standing]) -> Released {
     let is_patient = |one: &Standing| one.patience_s.is_infinite() || one.waited_s <= INSIDE_S;
     let inside = |one: &Standing| !is_patient(one) && is_inside(map, one);
     let inside: Vec<bool> = agents.iter().map(inside).collect();
     let waits = |i: &usize| inside[*i] || agents[*i].waited_s > agents[*i].patience_s;
     let waiting: Vec<usize> = (0..agents.len()).filter(waits).collect();
     let walks = |i: usize| agents[i].agent.kind == AgentKind::Pedestrian;
-    let (mut free, mut people) = (Vec::new(), Vec::new());
+    let (mut free, mut people, mut stuck) = (Vec::new(), Vec::new(), Vec::new());
     for &i in &waiting {
         let agent = &agents[i].agent;
         let reached = ahead(map, &agents[i]);
@@ -131,6 +147,12 @@ pub(super) fn free_to_go(map: &MapGraph, lights: &[Light], agents: &[Standing]) 
         };
         if !is_shut(&reached, lights) && (holding.is_empty() || squeezes()) {
             free.push((i, reached));
+        } else if inside[i]
+            && holding
+                .iter()
+                .any(|j| stands_across(agent, &agents[*j].agent))
+        {
+            stuck.push(i);
         }
     }
     let goes_first = |(i, own): &(usize, Vec<LaneAhead<'_>>), (j, its): &(usize, Vec<_>)| {
@@ -148,7 +170,76 @@ pub(super) fn free_to_go(map: &MapGraph, lights: &[Light], agents: &[Standing]) 
     next.extend(people);
     next.sort_unstable();
     next.dedup();
-    next
+    Released {
+        go: next,
+        back_up: backing(map, agents, &stuck),
+    }
+}
+
+/// Whether another vehicle or bicycle stands at an angle to an agent.
+fn stands_across(agent: &Agent, other: &Agent) -> bool {
+    let drives = matches!(other.kind, AgentKind::Vehicle | AgentKind::Bicycle);
+    let turn = angle_difference(agent.state.pose.heading, other.state.pose.heading);
+    drives && other.state.speed() < MOVES && turn.abs() > CROSSES
+}
+
+/// Those that back up, of the agents that are held in a junction by others that stand across their path:
+/// the vehicle that came last of those that have room behind and stand in the way of another themselves.
+fn backing(map: &MapGraph, agents: &[Standing], stuck: &[usize]) -> Vec<(usize, Vec<usize>)> {
+    let apart = |one: &Agent, other: &Agent| {
+        let (from, to) = (one.state.pose.position, other.state.pose.position);
+        from.distance(to)
+    };
+    let blocked = |i: usize| -> Vec<usize> {
+        let agent = &agents[i].agent;
+        let is_blocked = |other: &Standing| {
+            let reached = ahead(map, other);
+            !reached.is_empty() && holds(&reached, &other.agent, agent, true, &USUAL)
+        };
+        let others = agents.iter().enumerate();
+        let others = others.filter(|(_, other)| {
+            apart(agent, &other.agent) < MEETING_M
+                && stands_across(agent, &other.agent)
+                && is_inside(map, other)
+                && is_blocked(other)
+        });
+        others.map(|(j, _)| j).collect()
+    };
+    let could = |i: usize| {
+        let one = &agents[i];
+        let all = agents.iter().map(|other| &other.agent);
+        one.agent.kind == AgentKind::Vehicle
+            && one.waited_s > STUCK_S
+            && has_room_behind(&one.agent, all)
+    };
+    let could = stuck.iter().copied().filter(|&i| could(i));
+    let could = could.map(|i| (i, blocked(i)));
+    let could: Vec<_> = could.filter(|(_, others)| !others.is_empty()).collect();
+    let came_later = |one: &Standing, other: &Standing| {
+        apart(&one.agent, &other.agent) < MEETING_M
+            && (-one.waited_s, one.agent.id) > (-other.waited_s, other.agent.id)
+    };
+    let is_last = |i: usize| {
+        let mut others = could.iter().filter(|(j, _)| *j != i);
+        !others.any(|(j, _)| came_later(&agents[*j], &agents[i]))
+    };
+    could.iter().filter(|(i, _)| is_last(*i)).cloned().collect()
+}
+
+/// Whether nobody is behind an agent, or about to come there.
+pub(super) fn has_room_behind<'a>(agent: &Agent, mut all: impl Iterator<Item = &'a Agent>) -> bool {
+    let own = agent.state.pose.inverse();
+    let beside = agent.width / 2.0 + BESIDE_IT_M;
+    !all.any(|other| {
+        let metres = agent.length / 2.0 + BEHIND_M + GAP_S * other.state.speed();
+        let is_behind = |point: DVec2| {
+            let place = own * point;
+            (-metres..0.0).contains(&place.x) && place.y.abs() < beside
+        };
+        let body = other.oriented_box().corners();
+        let mut body = body.into_iter().chain([other.state.pose.position]);
+        other.id != agent.id && body.any(is_behind)
+    })
 }
 
 /// Whether an agent is on a lane of a junction, or was driving and is between its lanes.
@@ -293,8 +384,8 @@ mod tests {
                 has_driven,
             })
             .collect();
-        let found = free_to_go(scene.map, scene.now().lights(), &agents);
-        found.into_iter().map(|i| agents[i].agent.id.0).collect()
+        let found = released(scene.map, scene.now().lights(), &agents);
+        found.go.into_iter().map(|i| agents[i].agent.id.0).collect()
     }
 
     fn scenario(text: &str) -> Scenario {
@@ -419,12 +510,50 @@ mod tests {
                 has_driven: true,
             };
             let agents: Vec<_> = scene.now().agents().iter().map(standing).collect();
-            free_to_go(&MapGraph::new(parts).unwrap(), &[], &agents)
+            released(&MapGraph::new(parts).unwrap(), &[], &agents).go
         };
         // They hold each other, 0.2 m beside their paths.
         assert_eq!(go(true, 9.5, 20.0), [0]);
         assert!(go(false, 9.5, 20.0).is_empty() && go(true, 8.5, 20.0).is_empty());
         // One that is driven from outside is not released.
         assert!(go(true, 9.5, f64::INFINITY).is_empty());
+    }
+
+    #[test]
+    fn of_vehicles_stuck_in_a_junction_the_last_one_backs_up() {
+        let back = |more: &str, waited: [f64; 2], inside: bool| {
+            // Each stands in the path of the other.
+            let scenario = scenario(&format!(
+                "lane 1: 0,0 60,0\nlane 2: 30,-40 30,40\n\
+                 ego vehicle 0: 27.3,0\nagent vehicle 1: 30,-3.2 heading 1.5708\n{more}"
+            ));
+            let mut parts = scenario.map.parts().clone();
+            for lane in &mut parts.lanes {
+                lane.in_intersection = inside;
+            }
+            let standing = |agent: &Agent| Standing {
+                agent: *agent,
+                waited_s: *waited.get(agent.id.0 as usize).unwrap_or(&0.0),
+                patience_s: 20.0,
+                has_driven: true,
+            };
+            let scene = scenario.present();
+            let agents: Vec<_> = scene.now().agents().iter().map(standing).collect();
+            let released = released(&MapGraph::new(parts).unwrap(), &[], &agents);
+            assert!(released.go.is_empty(), "{released:?}");
+            let back_up = released.back_up.iter();
+            back_up.map(|(i, _)| *i).collect::<Vec<_>>()
+        };
+        assert_eq!(back("", [13.0, 20.0], true), [0]);
+        assert_eq!(back("", [20.0, 13.0], true), [1]);
+        assert!(back("", [13.0, 20.0], false).is_empty());
+        assert!(back("", [11.0, 11.0], true).is_empty());
+        // Without room behind the last one it is the other; nor may somebody be about to come there.
+        let behind = "agent vehicle 2: 21,0";
+        assert_eq!(back(behind, [13.0, 20.0], true), [1]);
+        let coming = "agent vehicle 2: 12,0 velocity 3,0";
+        assert_eq!(back(coming, [13.0, 20.0], true), [1]);
+        let far = "agent vehicle 2: 12,0";
+        assert_eq!(back(far, [13.0, 20.0], true), [0]);
     }
 }

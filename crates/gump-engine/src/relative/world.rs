@@ -35,10 +35,10 @@ use crate::nucleus::uniform;
 use crate::relative::engine::{Draw, KEPT, MapMemory, RelativeEngine, Workspace};
 use crate::relative::intent::Intent;
 use crate::relative::rules::{
-    Driven, Shut, StopLine, kinematically_limited, obey_lines, resolve, start,
+    Driven, Known, Shut, StopLine, kinematically_limited, obey_lines, resolve, start,
 };
 use crate::relative::seen::{FrameIndex, ObservedAgent, add_presents};
-use crate::relative::waiting::{Standing, free_to_go};
+use crate::relative::waiting::{Standing, has_room_behind, released};
 use crate::sampling::{Routes, SamplingConfig};
 
 pub use live::LiveFuture;
@@ -71,6 +71,12 @@ const START: f64 = 1.0;
 /// their past (see [`View::is_free`](gump_model::relative::graph::View::is_free)), and are given
 /// routes.
 const LATE: usize = 18;
+/// Who stands in a junction across the way of another that stands across its own backs up by so many
+/// metres a step, for so many steps, and then waits for so many: two metres in two seconds, as drivers
+/// do, and time for the other to pass. Chosen by hand (decision 35).
+const BACK_M: f64 = 0.5;
+const BACKS_UP: usize = 4;
+const WAITS_BACK: usize = 14;
 /// An agent that was faster than this is not parked, metres per second: more than the jitter of
 /// recorded boxes. Chosen by hand (decision 26).
 const DRIVES: f64 = 2.0;
@@ -355,6 +361,10 @@ struct Member {
     has_driven: bool,
     /// Whether it stands in a lane although nothing holds it.
     could_go: bool,
+    /// Steps for which it backs up for others, and waits afterwards.
+    backing: usize,
+    /// Steps for which another does so for it.
+    let_pass: usize,
     /// Where it means to go.
     intent: Intent,
 }
@@ -616,14 +626,16 @@ impl Future {
         let mut is_one_waiting = false;
         for member in &mut self.members {
             member.could_go = false;
-            is_one_waiting |= member.idle > PATIENCE_S[0];
+            member.backing = member.backing.saturating_sub(1);
+            member.let_pass = member.let_pass.saturating_sub(1);
+            is_one_waiting |= member.idle_s() > PATIENCE_S[0];
             let is_long = member.waited > WAITED_S && stands_in_lane(map, &member.agent);
             limits.push(is_long.then_some(WAITED_S));
         }
         if is_one_waiting {
             let members = self.members.iter().map(|member| Standing {
                 agent: member.agent,
-                waited_s: member.idle,
+                waited_s: member.idle_s(),
                 patience_s: match driven == Some(member.agent.id) {
                     true => f64::INFINITY,
                     false => self.patience_s(member),
@@ -637,8 +649,20 @@ impl Future {
                 has_driven: false,
             });
             let all: Vec<_> = members.chain(others).collect();
-            for i in free_to_go(map, &self.lights, &all) {
+            let released = released(map, &self.lights, &all);
+            for (i, blocked) in released.back_up {
+                self.members[i].backing = BACKS_UP + WAITS_BACK;
+                for j in blocked {
+                    if let Some(member) = self.members.get_mut(j) {
+                        member.let_pass = BACKS_UP + WAITS_BACK;
+                    }
+                }
+            }
+            for i in released.go {
                 let member = &mut self.members[i];
+                if member.backing > 0 {
+                    continue;
+                }
                 member.could_go = true;
                 limits[i] = None;
                 member.seen.restart(engine, START);
@@ -706,13 +730,14 @@ impl Future {
                 .collect(),
         };
         let unheeded = driven.filter(|_| !sampling.yields_to_driven);
-        let is_parked = |i: usize| {
-            let member = &self.members[i];
-            member.waited > PATIENCE_S[0] && !member.has_driven
-        };
-        let route = |i: usize| self.members[i].intent.route();
-        let who = (unheeded, is_parked, route);
-        let shut = Shut::of(&self.scene.source, &agents, who, lines, &colours);
+        let known = self.members.iter().enumerate().map(|(i, member)| Known {
+            is_unheeded: unheeded == Some(i),
+            is_parked: member.waited > PATIENCE_S[0] && !member.has_driven,
+            stands_back: member.backing > 0,
+            route: member.intent.route(),
+        });
+        let known: Vec<Known<'_>> = known.collect();
+        let shut = Shut::of(&self.scene.source, &agents, &known, lines, &colours);
         obey_lines(&agents, driven, &shut, redraws, &mut moves, &mut again);
         // Redraws that keep agents clear of others must not make them cross such a line.
         let kept = moves.clone();
@@ -728,8 +753,23 @@ impl Future {
             index,
             is_heeded: sampling.yields_to_driven,
         });
+        self.back_up(&mut moves);
         resolve(&agents, driven, lane_map, redraws, &mut moves, &mut lawful);
+        self.back_up(&mut moves);
         moves
+    }
+
+    /// The moves of those who back up for others, or wait afterwards until these have passed.
+    fn back_up(&self, moves: &mut [Pose]) {
+        let backing = self.members.iter().enumerate();
+        for (i, member) in backing.filter(|(_, member)| member.backing > 0) {
+            let everybody = self.members.iter().map(|member| &member.agent);
+            let backs = member.backing > WAITS_BACK && has_room_behind(&member.agent, everybody);
+            moves[i] = match backs {
+                true => Pose::new(-BACK_M, 0.0, 0.0),
+                false => Pose::IDENTITY,
+            };
+        }
     }
 
     /// Returns draws of the next states of all agents but the driven one, from separate streams.
@@ -836,12 +876,26 @@ impl Member {
             idle: 0.0,
             has_driven: state.speed() > DRIVES,
             could_go: false,
+            backing: 0,
+            let_pass: 0,
             intent: Intent::default(),
         }
     }
 
     fn now(&self) -> Shown {
         self.seen.now()
+    }
+
+    /// Time that it has been idle, seconds. Who backs up still stands in the junction for the others, and
+    /// comes last; whom it lets pass does not wait again.
+    fn idle_s(&self) -> f64 {
+        let stands = self.now().velocity().length() < CREEPS;
+        let least = match (self.backing > 0, self.let_pass > 0 && stands) {
+            (true, _) => PATIENCE_S[0] + TOKEN_DT,
+            (_, true) => PATIENCE_S[0] + 2.0 * TOKEN_DT,
+            _ => 0.0,
+        };
+        self.idle.max(least)
     }
 
     /// What a history tells that is longer than what the network sees of it: whether the agent drove

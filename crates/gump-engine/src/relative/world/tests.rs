@@ -6,13 +6,16 @@ use gump_scene::{LaneId, Scenario, fixture};
 use super::*;
 
 fn world(routes: Routes) -> RelativeWorld {
+    sampled(RelativeSampling {
+        routes,
+        ..RelativeSampling::default()
+    })
+}
+
+fn sampled(sampling: RelativeSampling) -> RelativeWorld {
     let path = "../../datasets/weights/gump-relative.safetensors";
     let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join(path);
     let weights = RelativeWeights::read(&std::fs::read(path).unwrap()).unwrap();
-    let sampling = RelativeSampling {
-        routes,
-        ..RelativeSampling::default()
-    };
     RelativeWorld::of_weights(&weights, sampling).unwrap()
 }
 
@@ -78,4 +81,51 @@ fn without_routes_there_are_none() {
     let (future, meant) = future(&world(Routes::Never), &fork(), 1, 6);
     assert_eq!(meant, None);
     assert_eq!(future.members[0].intent.route(), None);
+}
+
+/// Two lanes that cross in a junction, and on each a vehicle that stands in the way of the other.
+fn stuck() -> Scenario {
+    let mut scenario = fixture::scenario(
+        "lane 1: -60,0 20,0 speed 13 next 2
+         lane 2: 20,0 40,0 speed 13 next 3
+         lane 3: 40,0 120,0 speed 13
+         lane 4: 30,-70 30,-10 speed 13 next 5
+         lane 5: 30,-10 30,10 speed 13 next 6
+         lane 6: 30,10 30,90 speed 13
+         ego vehicle 0: 26.65,0
+         agent vehicle 1: 30,-2.2 heading 1.5708",
+    )
+    .unwrap();
+    let mut parts = scenario.map.parts().clone();
+    for lane in &mut parts.lanes {
+        lane.in_intersection = [2, 5].contains(&lane.id.0);
+    }
+    scenario.map = Arc::new(MapGraph::new(parts).unwrap());
+    scenario
+}
+
+#[test]
+fn one_of_two_that_hold_each_other_in_a_junction_backs_up() {
+    let rules = RelativeSampling {
+        redraws: 12,
+        limits: true,
+        ..RelativeSampling::default()
+    };
+    let (world, scenario) = (sampled(rules), stuck());
+    let at = |future: &Future, i: usize| future.members[i].now().pose.position;
+    let mut backed = 0;
+    for seed in 0..8 {
+        let back = |steps: usize| {
+            let (future, _) = future(&world, &scenario, seed, steps);
+            [at(&future, 0).x < 26.4, at(&future, 1).y < -2.5]
+        };
+        // 12 to 16 s after the start.
+        let back = [24, 26, 28, 32].map(back);
+        assert!(back.iter().all(|back| *back != [true, true]), "{back:?}");
+        backed += usize::from(back.iter().any(|back| *back != [false, false]));
+        let (after, _) = future(&world, &scenario, seed, 80);
+        let gone = [at(&after, 0).x > 40.0, at(&after, 1).y > 10.0];
+        assert_eq!(gone, [true, true], "{seed}");
+    }
+    assert!(backed >= 4, "{backed}");
 }
