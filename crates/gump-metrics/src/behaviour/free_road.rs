@@ -31,7 +31,7 @@ use super::{Counter, MOVES, STANDS};
 // Bounds are chosen by hand and generous: what may be a reason counts as one. The logs of
 // recorded/tune and recorded/test have no free stop with them.
 /// A vehicle farther than this beside the centre line is not on the lane, metres.
-const ON_LANE_M: f64 = 1.0;
+pub(super) const ON_LANE_M: f64 = 1.0;
 /// Distance ahead of the front bumper within which agents are considered, and lights, signs and the
 /// end of the road, metres.
 const OTHERS_M: f64 = 15.0;

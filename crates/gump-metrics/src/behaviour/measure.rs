@@ -11,6 +11,8 @@ use gump_scene::{AgentId, AgentKind};
 pub enum Measure {
     /// A vehicle that stands for the whole log moves away from its place.
     ParkedMove,
+    /// The same of a vehicle that is beside the lanes in the present.
+    RoadsideMove,
     /// A vehicle stops without a reason.
     FreeRoadStop,
     /// A vehicle that has moved stands for ten seconds without a reason.
@@ -49,8 +51,9 @@ pub enum Measure {
 
 impl Measure {
     /// All, in the order of tables.
-    pub const ALL: [Self; 18] = [
+    pub const ALL: [Self; 19] = [
         Self::ParkedMove,
+        Self::RoadsideMove,
         Self::FreeRoadStop,
         Self::FreeRoadStanding,
         Self::NewOverlap,
@@ -74,6 +77,7 @@ impl Measure {
     pub fn name(self) -> &'static str {
         match self {
             Self::ParkedMove => "parked_move",
+            Self::RoadsideMove => "roadside_move",
             Self::FreeRoadStop => "free_road_stop",
             Self::FreeRoadStanding => "free_road_standing",
             Self::NewOverlap => "new_overlap",
@@ -103,6 +107,7 @@ impl Measure {
     pub fn per(self) -> &'static str {
         match self {
             Self::ParkedMove => "parked vehicle",
+            Self::RoadsideMove => "vehicle parked beside the lanes",
             Self::FreeRoadStop | Self::LaneChange | Self::RoadExit => "minute of moving",
             Self::FreeRoadStanding => "vehicle that moves",
             Self::NewOverlap | Self::Standing => "agent",
@@ -139,7 +144,7 @@ impl Measure {
     pub fn needs_whole_horizon(self) -> bool {
         matches!(
             self,
-            Self::ParkedMove | Self::NewOverlap | Self::FreeRoadStanding
+            Self::ParkedMove | Self::RoadsideMove | Self::NewOverlap | Self::FreeRoadStanding
         )
     }
 }

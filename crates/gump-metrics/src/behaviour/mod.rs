@@ -6,7 +6,8 @@
 //!
 //! | measure | event | per |
 //! |---|---|---|
-//! | `parked_move` | a vehicle that stood for the whole log (never over 0.5 m from its present place, seen in at least half of the frames) gets over 2 m away from it | vehicle that stood |
+//! | `parked_move` | a vehicle that stood for the whole log (never over 0.5 m from its present place, seen in at least half of the frames) gets over 2 m away from it | vehicle that stood, in a lane or beside the lanes |
+//! | `roadside_move` | the same of those that are beside the lanes in the present: not within 1 m of the centre of one that they are along within 30 degrees | such a vehicle |
 //! | `free_road_stop` | a vehicle that has moved stands for at least 1 s, for no reason that can be seen: `free_road.rs` lists the reasons | minute that vehicles move |
 //! | `free_road_standing` | a vehicle that has moved then stands for at least 10 s after the present, without such a reason at any of these seconds; each vehicle once | vehicle that moves, before or after the present, and is there for at least 10 s after it |
 //! | `new_overlap` | a pair of boxes is over 0.1 m deep in one another and did not overlap in the present; each pair once | agent, of all classes |
@@ -27,8 +28,8 @@
 //! To *stand* is to move less than 0.3 m within a second, to *move* more than 1 m. Speeds are
 //! computed from positions, not from velocities that a tracker or a network states. Counted are
 //! moving kinds of agents that are in the present frame; where agents enter and leave, see
-//! [`Behaviour::with_newcomers`]. Futures that end before the horizon have no `parked_move`, no
-//! `new_overlap` and no `free_road_standing`, which grow with time.
+//! [`Behaviour::with_newcomers`]. Futures that end before the horizon have no `parked_move`,
+//! `roadside_move`, `new_overlap` and `free_road_standing`, which grow with time.
 //!
 //! Few phases of lights begin and end within the 8 s of a log. `red_phase_s` and `green_phase_s` are
 //! therefore the total time of the colour divided by the number of its ends, over all lights and

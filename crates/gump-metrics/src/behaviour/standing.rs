@@ -1,9 +1,12 @@
 //! Standing, starting and stopping.
 
 use std::collections::BTreeSet;
+use std::f64::consts::FRAC_PI_6;
 
 use gump_scene::{Agent, AgentId, AgentKind, Scenario};
 
+use super::free_road::ON_LANE_M;
+use super::reach::nearest;
 use super::{Class, Counter, Key, MOMENTS, MOVES, Measure, STANDS, vehicles};
 use crate::behaviour::Count;
 use crate::behaviour::track::Track;
@@ -198,6 +201,9 @@ impl Counter<'_> {
             let away = self.take.ahead().find(is_away);
             let events = f64::from(u8::from(away.is_some()));
             self.add(Measure::ParkedMove, Class::Vehicle, events, 1.0);
+            if nearest(self.map, place, ON_LANE_M, FRAC_PI_6).is_none() {
+                self.add(Measure::RoadsideMove, Class::Vehicle, events, 1.0);
+            }
             if let Some(k) = away {
                 self.note(Measure::ParkedMove, track.id, None, k);
             }

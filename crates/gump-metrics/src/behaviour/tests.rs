@@ -71,6 +71,8 @@ fn a_parked_vehicle_that_moves_counts() {
         let tally = Behaviour::new(&scenario, 8).of(&rollout).tally;
         let found = tally.count(Measure::ParkedMove, Class::Vehicle, 8);
         assert_eq!((found.events, found.of), (expected, 1.0), "{metres} m");
+        let beside = tally.count(Measure::RoadsideMove, Class::Vehicle, 8);
+        assert_eq!((beside.events, beside.of), (expected, 1.0), "{metres} m");
     };
     check(2.5, 1.0);
     check(-2.5, 1.0);
@@ -81,6 +83,17 @@ fn a_parked_vehicle_that_moves_counts() {
         log.count(Measure::ParkedMove, Class::Vehicle, 8).rate(),
         Some(0.0)
     );
+}
+
+#[test]
+fn who_stands_in_a_lane_is_not_at_the_roadside() {
+    for (y, of) in [(0.9, 0.0), (-5.0, 1.0)] {
+        let scenario = scenario(&format!("{ROAD}agent vehicle 1: 30,{y}"));
+        let tally = Behaviour::new(&scenario, 8).log().tally;
+        let count = |measure| tally.count(measure, Class::Vehicle, 8).of;
+        assert_eq!(count(Measure::ParkedMove), 1.0, "{y}");
+        assert_eq!(count(Measure::RoadsideMove), of, "{y}");
+    }
 }
 
 #[test]
