@@ -23,13 +23,14 @@ mod gru;
 mod linear;
 mod loss;
 mod norm;
+mod pool;
 mod table;
 
 pub use absolute::mean_absolute_difference;
 pub use attention::{
     causal_attention, causal_self_attention, cross_attention, cross_attention_padded,
 };
-pub use batch_norm::batch_norm;
+pub use batch_norm::{Then, batch_norm};
 pub use conv::conv2d;
 pub use divergence::{weighted_divergence, weighted_entropy};
 pub use edge_attention::edge_attention;
@@ -38,6 +39,7 @@ pub use gru::gru;
 pub use linear::{linear, reduced_linear};
 pub use loss::{Targets, linear_cross_entropy, masked_cross_entropy};
 pub use norm::layer_norm;
+pub use pool::largest_of_nine;
 pub use table::{embedding_sum, table_rows};
 
 pub use deferred::Deferred;
