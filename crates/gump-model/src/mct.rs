@@ -12,9 +12,11 @@
 use std::sync::Arc;
 
 use candle_core::{Result, Tensor};
-use gump_nn::layers::{Dropout, LayerNorm, Linear, TABLE_DEVIATION, drop_out};
+use gump_nn::layers::{
+    Dropout, LayerNorm, Linear, TABLE_DEVIATION, attention_half, drop_out, feed_forward,
+};
 use gump_nn::ops;
-use gump_nn::ops::embedding_sum;
+use gump_nn::ops::{Join, Seen, embedding_sum};
 use gump_nn::parameters::{Init, Scope};
 use gump_tokenizer::N_CLASSES;
 
@@ -58,11 +60,15 @@ impl Block {
         cache: Option<&mut Option<(Tensor, Tensor)>>,
         dropout: Option<&Dropout>,
     ) -> Result<Tensor> {
-        let c = x.dim(2)?;
-        let qkv = self.qkv.forward(&self.norm_attention.forward(x)?)?; // [B, T, 3C]
-        let attended = match cache {
-            None => ops::causal_self_attention(&qkv, self.heads)?,
+        let mask = || dropout.map(|d| d.mask(x.shape(), x.device())).transpose();
+        let (norm, out) = (&self.norm_attention, &self.attention_out);
+        let attention_mask = mask()?;
+        let join = attention_mask.as_ref().map_or(Join::Plain, Join::Masked);
+        let x = match cache {
+            None => attention_half(x, norm, [&self.qkv, out], (Seen::Past, self.heads), join)?,
             Some(past) => {
+                let c = x.dim(2)?;
+                let qkv = self.qkv.forward(&norm.forward(x)?)?; // [B, T, 3C]
                 let q = qkv.narrow(2, 0, c)?;
                 let mut k = qkv.narrow(2, c, c)?;
                 let mut v = qkv.narrow(2, 2 * c, c)?;
@@ -73,12 +79,13 @@ impl Block {
                     v = Tensor::cat(&[past_v, &v], 1)?;
                 }
                 *past = Some((k.contiguous()?, v.contiguous()?));
-                ops::causal_attention(&q, &k, &v, self.heads, offset, None)?
+                let attended = ops::causal_attention(&q, &k, &v, self.heads, offset, None)?;
+                join.add(x, &out.forward(&attended)?)?
             }
         }; // [B, T, C]
-        let x = (x + drop_out(self.attention_out.forward(&attended)?, dropout)?)?;
-        let hidden = ops::gelu(&self.mlp_in.forward(&self.norm_mlp.forward(&x)?)?)?; // [B, T, 4C]
-        &x + drop_out(self.mlp_out.forward(&hidden)?, dropout)?
+        let mlp_mask = mask()?;
+        let join = mlp_mask.as_ref().map_or(Join::Plain, Join::Masked);
+        feed_forward(&x, &self.norm_mlp, [&self.mlp_in, &self.mlp_out], join)
     }
 }
 
@@ -148,18 +155,13 @@ impl CrossBlock {
     }
 
     fn forward(&self, x: &Tensor, (k, v): &(Tensor, Tensor)) -> Result<Tensor> {
-        let q = self.query.forward(&self.norm.forward(x)?)?;
-        let attended = self
-            .out
-            .forward(&ops::cross_attention(&q, k, v, self.heads)?)?;
-        let x = (x + attended.broadcast_mul(&self.gate_attention.tanh()?)?)?;
-        let mlp = self.mlp_out.forward(&ops::gelu(
-            &self.mlp_in.forward(&self.norm_mlp.forward(&x)?)?,
-        )?)?;
-        match &self.gate_mlp {
-            Some(gate) => &x + mlp.broadcast_mul(&gate.tanh()?)?,
-            None => x + mlp,
-        }
+        let gate = self.gate_attention.tanh()?;
+        let layers = [&self.query, &self.out];
+        let seen = (Seen::Memory(k, v), self.heads);
+        let x = attention_half(x, &self.norm, layers, seen, Join::Gated(&gate))?;
+        let gate = self.gate_mlp.as_ref().map(Tensor::tanh).transpose()?;
+        let join = gate.as_ref().map_or(Join::Plain, Join::Gated);
+        feed_forward(&x, &self.norm_mlp, [&self.mlp_in, &self.mlp_out], join)
     }
 }
 

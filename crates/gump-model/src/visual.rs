@@ -7,6 +7,7 @@
 use candle_core::{Result, Tensor, Var};
 use gump_nn::layers::Linear;
 use gump_nn::ops;
+use gump_nn::ops::Then;
 use gump_nn::parameters::{Init, Scope};
 
 use crate::ModelError;
@@ -83,9 +84,9 @@ impl BatchNorm {
     }
 
     /// `x` is [S, channels, H, W].
-    fn forward(&self, x: &Tensor, training: bool) -> Result<Tensor> {
+    fn forward(&self, x: &Tensor, then: Then<'_>, training: bool) -> Result<Tensor> {
         if training {
-            let (y, [mean, variance]) = ops::batch_norm(x, &self.weight, &self.bias)?;
+            let (y, [mean, variance]) = ops::batch_norm(x, &self.weight, &self.bias, then)?;
             // PyTorch's momentum, and below its addition to variances.
             for (running, batch) in [(&self.mean, mean), (&self.variance, variance)] {
                 running.set(&((running.as_tensor() * 0.9)? + (batch * 0.1)?)?)?;
@@ -98,9 +99,10 @@ impl BatchNorm {
         let normal = x
             .broadcast_sub(&spread(&mean.detach())?)?
             .broadcast_div(&(spread(&variance.detach())? + 1e-5)?.sqrt()?)?;
-        normal
+        let normal = normal
             .broadcast_mul(&spread(&self.weight)?)?
-            .broadcast_add(&spread(&self.bias)?)
+            .broadcast_add(&spread(&self.bias)?)?;
+        then.apply(normal)
     }
 }
 
@@ -154,18 +156,20 @@ impl Residual {
     }
 
     fn forward(&self, x: &Tensor, training: bool) -> Result<Tensor> {
-        let mut y = x.clone();
-        for (i, (conv, norm)) in self.convolutions.iter().enumerate() {
-            y = norm.forward(&conv.forward(&y)?, training)?;
-            if i + 1 < self.convolutions.len() {
-                y = y.relu()?;
-            }
-        }
         let straight = match &self.shortcut {
-            Some((conv, norm)) => norm.forward(&conv.forward(x)?, training)?,
+            Some((conv, norm)) => norm.forward(&conv.forward(x)?, Then::Nothing, training)?,
             None => x.clone(),
         };
-        (y + straight)?.relu()
+        let mut y = x.clone();
+        for (i, (conv, norm)) in self.convolutions.iter().enumerate() {
+            let then = if i + 1 < self.convolutions.len() {
+                Then::Rectify
+            } else {
+                Then::AddAndRectify(&straight)
+            };
+            y = norm.forward(&conv.forward(&y)?, then, training)?;
+        }
+        Ok(y)
     }
 }
 
@@ -221,37 +225,13 @@ impl ResNet {
     }
 
     fn forward(&self, x: &Tensor, training: bool) -> Result<Tensor> {
-        let x = self
-            .stem
-            .1
-            .forward(&self.stem.0.forward(x)?, training)?
-            .relu()?;
-        let x = largest_of_three(&largest_of_three(&x, 2)?, 3)?;
+        let (conv, norm) = &self.stem;
+        let x = norm.forward(&conv.forward(x)?, Then::Rectify, training)?;
+        let x = ops::largest_of_nine(&x)?;
         self.blocks
             .iter()
             .try_fold(x, |x, block| block.forward(&x, training))
     }
-}
-
-/// The maximum of three neighbours along a dimension of even length, around every second: half of
-/// pooling. The tensor library does not differentiate overlapping pooling.
-///
-/// `x` is not negative, so that zeros beyond the border are never the largest alone.
-fn largest_of_three(x: &Tensor, dim: usize) -> Result<Tensor> {
-    let n = x.dim(dim)? / 2;
-    let padded = x.pad_with_zeros(dim, 1, 1)?;
-    let mut dims = padded.dims().to_vec();
-    dims[dim] = n + 1;
-    dims.insert(dim + 1, 2);
-    let pairs = padded.reshape(dims)?;
-    let every_second = |i| pairs.narrow(dim + 1, i, 1)?.squeeze(dim + 1);
-    let (even, odd) = (every_second(0)?, every_second(1)?);
-    let (left, middle, right) = (
-        even.narrow(dim, 0, n)?,
-        odd.narrow(dim, 0, n)?,
-        even.narrow(dim, 1, n)?,
-    );
-    left.maximum(&middle)?.maximum(&right)
 }
 
 /// The encoder for CPUs: patches of 4 px, then halved once; no batch statistics, so a scene's
@@ -355,7 +335,7 @@ impl Visual {
         let adapted = self.adaptor.0.forward(&map)?;
         let adapted = match &self.adaptor.1 {
             Some(norm) => {
-                let x = norm.forward(&adapted, training)?;
+                let x = norm.forward(&adapted, Then::Nothing, training)?;
                 // The released code's leaky ReLU.
                 x.maximum(&(&x * 0.01)?)?
             }
@@ -422,24 +402,5 @@ impl Reconstruction {
             .permute(vec![0, 2, 4, 1, 3, 5])?
             .reshape((scenes, n * n, self.planes * self.stride * self.stride))?;
         ops::mean_absolute_difference(&drawn, &patches)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use candle_core::Device;
-
-    use super::*;
-
-    #[test]
-    fn two_halves_of_pooling_are_pooling() {
-        let numbers: Vec<f32> = (0..2 * 3 * 8 * 6).map(|i| (i as f32).sin().abs()).collect();
-        let x = Tensor::from_vec(numbers, (2, 3, 8, 6), &Device::Cpu).unwrap();
-        let ours = largest_of_three(&largest_of_three(&x, 2).unwrap(), 3).unwrap();
-        let padded = x.pad_with_zeros(2, 1, 1).unwrap().pad_with_zeros(3, 1, 1);
-        let pooled = padded.unwrap().max_pool2d_with_stride(3, 2).unwrap();
-        assert_eq!(ours.dims(), [2, 3, 4, 3]);
-        let flat = |t: &Tensor| t.flatten_all().unwrap().to_vec1::<f32>().unwrap();
-        assert_eq!(flat(&ours), flat(&pooled));
     }
 }

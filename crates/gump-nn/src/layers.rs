@@ -1,12 +1,13 @@
 //! Layers with parameters: linear, layer normalisation, dropout.
 
-use candle_core::{DType, Result, Tensor};
+use candle_core::{DType, Device, Result, Shape, Tensor};
 use gump_seed::Seed;
 
 pub use gump_kernels::norm::NORM_EPS;
 
 use crate::NnError;
 use crate::ops;
+use crate::ops::{Affine, Join, Scaling, Seen};
 use crate::parameters::{Init, Scope};
 
 /// Deviation from which every table of embeddings starts, as GPT-2's do.
@@ -43,6 +44,16 @@ impl LayerNorm {
     /// Another width.
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
         ops::layer_norm(x, &self.weight, &self.bias, NORM_EPS as f32)
+    }
+}
+
+impl LayerNorm {
+    fn scaling(&self) -> Scaling<'_> {
+        Scaling {
+            weight: &self.weight,
+            bias: &self.bias,
+            eps: NORM_EPS as f32,
+        }
     }
 }
 
@@ -107,6 +118,13 @@ impl Linear {
         ops::linear(x, &self.weight, self.bias.as_ref())
     }
 
+    fn affine(&self) -> Affine<'_> {
+        Affine {
+            weight: &self.weight,
+            bias: self.bias.as_ref(),
+        }
+    }
+
     /// The matrix, `[out, in]`.
     pub fn weight(&self) -> &Tensor {
         &self.weight
@@ -116,6 +134,59 @@ impl Linear {
     pub fn bias(&self) -> Option<&Tensor> {
         self.bias.as_ref()
     }
+}
+
+/// `x` plus `second(gelu(first(norm(x))))`, joined as `join` says; as one operation where the
+/// products are f32.
+///
+/// Shape: `x` `[.., C]`, the result alike.
+///
+/// # Errors
+/// Layers of other widths.
+pub fn feed_forward(
+    x: &Tensor,
+    norm: &LayerNorm,
+    [first, second]: [&Linear; 2],
+    join: Join<'_>,
+) -> Result<Tensor> {
+    if [first, second].iter().any(|l| l.product != DType::F32) {
+        let hidden = ops::gelu(&first.forward(&norm.forward(x)?)?)?;
+        return join.add(x, &second.forward(&hidden)?);
+    }
+    ops::feed_forward(x, norm.scaling(), first.affine(), second.affine(), join)
+}
+
+/// `x` plus `second(attention(first(norm(x))))`, joined as `join` says; as one operation where the
+/// products are f32.
+///
+/// Shape: `x` `[B, T, C]`, the result alike; `first` makes what [`Seen`] says.
+///
+/// # Errors
+/// Layers of other widths, or heads that do not divide theirs.
+pub fn attention_half(
+    x: &Tensor,
+    norm: &LayerNorm,
+    [first, second]: [&Linear; 2],
+    (seen, n_heads): (Seen<'_>, usize),
+    join: Join<'_>,
+) -> Result<Tensor> {
+    if [first, second].iter().any(|l| l.product != DType::F32) {
+        let q = first.forward(&norm.forward(x)?)?;
+        let attended = match seen {
+            Seen::Past => ops::causal_self_attention(&q, n_heads)?,
+            Seen::Memory(k, v) => ops::cross_attention(&q, k, v, n_heads)?,
+        };
+        return join.add(x, &second.forward(&attended)?);
+    }
+    let seen = (seen, n_heads);
+    ops::attention_half(
+        x,
+        norm.scaling(),
+        first.affine(),
+        seen,
+        second.affine(),
+        join,
+    )
 }
 
 /// Seeded dropout: absent at inference.
@@ -135,31 +206,34 @@ impl Dropout {
             calls: 0.into(),
         })
     }
+
+    /// The factors of the next tensor to be thinned out: 0, or what makes up for it.
+    ///
+    /// # Errors
+    /// A tensor error.
+    pub fn mask(&self, shape: &Shape, device: &Device) -> Result<Tensor> {
+        let seed = self.seed.fork(self.calls.get());
+        self.calls.set(self.calls.get() + 1);
+        let mut rng = seed.rng();
+        let keep = 1.0 / (1.0 - self.probability) as f32;
+        let threshold = (self.probability * f64::from(u32::MAX)) as u32;
+        let mask: Vec<f32> = (0..shape.elem_count())
+            .map(|_| {
+                if rand::RngCore::next_u32(&mut rng) < threshold {
+                    0.0
+                } else {
+                    keep
+                }
+            })
+            .collect();
+        Tensor::from_vec(mask, shape, device)
+    }
 }
 
 /// Drops entries of `x` and scales the rest up; returns `x` unchanged without dropout.
 pub fn drop_out(x: Tensor, dropout: Option<&Dropout>) -> Result<Tensor> {
-    let Some(Dropout {
-        probability,
-        seed,
-        calls,
-    }) = dropout
-    else {
-        return Ok(x);
-    };
-    let seed = seed.fork(calls.get());
-    calls.set(calls.get() + 1);
-    let mut rng = seed.rng();
-    let keep = 1.0 / (1.0 - probability) as f32;
-    let threshold = (probability * f64::from(u32::MAX)) as u32;
-    let mask: Vec<f32> = (0..x.elem_count())
-        .map(|_| {
-            if rand::RngCore::next_u32(&mut rng) < threshold {
-                0.0
-            } else {
-                keep
-            }
-        })
-        .collect();
-    &x * Tensor::from_vec(mask, x.shape(), x.device())?
+    match dropout {
+        Some(dropout) => &x * dropout.mask(x.shape(), x.device())?,
+        None => Ok(x),
+    }
 }

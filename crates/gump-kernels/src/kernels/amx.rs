@@ -15,11 +15,10 @@
 )]
 
 use std::arch::asm;
-use std::arch::x86_64::{__cpuid, __cpuid_count, __m512, _xgetbv};
-use std::mem::transmute;
+use std::arch::x86_64::{__cpuid, __cpuid_count, _xgetbv};
 use std::sync::OnceLock;
 
-use super::avx512_bf16::{Avx512Bf16, store_row};
+use super::avx512_bf16::{Avx512Bf16, store_rows};
 use super::bf16::{Lanes, Target, Unit};
 use crate::panels::PANEL;
 
@@ -177,10 +176,8 @@ impl Unit for Amx {
         // SAFETY: the value proves the instructions, `during` has cut the tiles, and both slices
         // were found to be `steps` long.
         unsafe { bf16_sums(block.as_ptr(), panel.as_ptr(), steps, &mut sums) };
-        for (r, sums) in sums.iter().enumerate().take(to.rows) {
-            // SAFETY: 32 numbers are two vectors, and the value proves that there are vectors.
-            unsafe { store_row(to, r, transmute::<[f32; PANEL], [__m512; 2]>(*sums)) };
-        }
+        // SAFETY: the value proves that there are vectors.
+        unsafe { store_rows(to, &sums) };
     }
 }
 

@@ -50,17 +50,17 @@ impl Avx512Bf16 {
     /// Packs lanes as `[lanes / 32, pairs / 16, 2, 16, 16]`: 16 lanes, each of 16 pairs, are a tile.
     pub(super) fn pack_tiles(self, from: Lanes<'_>, pairs: usize, tiles: &mut [u32]) {
         let (tiles, _) = tiles.as_chunks_mut::<{ GROUP * GROUP }>();
-        for (tile, out) in tiles.iter_mut().enumerate() {
-            let (block, step, half) = (
-                tile / (pairs / GROUP * 2),
-                tile / 2 % (pairs / GROUP),
-                tile % 2,
-            );
-            let (lane, p) = ((2 * block + half) * GROUP, step * GROUP);
+        let steps = pairs / GROUP;
+        let groups = tiles.len() / steps.max(1);
+        for i in 0..tiles.len() {
+            // All lanes of a step before the next step: numbers are read side by side where the
+            // lanes lie side by side.
+            let (step, lane) = (i / groups, i % groups);
             // SAFETY: the value proves the features.
-            let lanes = unsafe { rows_of_pairs(from, lane, p) };
+            let lanes = unsafe { rows_of_pairs(from, lane * GROUP, step * GROUP) };
+            let tile = (lane / 2 * steps + step) * 2 + lane % 2;
             // SAFETY: 16 vectors are 256 pairs.
-            *out = unsafe { transmute::<[__m512i; GROUP], [u32; GROUP * GROUP]>(lanes) };
+            tiles[tile] = unsafe { transmute::<[__m512i; GROUP], [u32; GROUP * GROUP]>(lanes) };
         }
     }
 }
@@ -119,10 +119,21 @@ fn tile<const N: usize>(block: &[[u32; BLOCK]], panel: &[[u32; PANEL]], to: &mut
     }
 }
 
+/// Takes the rows of a product that the target has into it.
+#[target_feature(enable = "avx512f")]
+pub(super) fn store_rows(to: &mut Target<'_>, sums: &[[f32; PANEL]]) {
+    for (r, sums) in sums.iter().enumerate().take(to.rows) {
+        // SAFETY: 32 numbers are two vectors.
+        store_row(to, r, unsafe {
+            transmute::<[f32; PANEL], [__m512; 2]>(*sums)
+        });
+    }
+}
+
 /// Takes row `r` of a product into its target.
 #[target_feature(enable = "avx512f")]
 #[inline]
-pub(super) fn store_row(to: &mut Target<'_>, r: usize, sums: [__m512; 2]) {
+fn store_row(to: &mut Target<'_>, r: usize, sums: [__m512; 2]) {
     if to.columns < PANEL {
         // SAFETY: two vectors are 32 numbers.
         return to.take_in(r, &unsafe { transmute::<[__m512; 2], [f32; PANEL]>(sums) });
@@ -298,6 +309,18 @@ fn rows_of_pairs(from: Lanes<'_>, lane: usize, p: usize) -> [__m512i; GROUP] {
         return rows_along(from, lane, p);
     }
     let mut columns = [_mm512_setzero_si512(); GROUP];
+    if lane + GROUP <= from.lanes && 2 * (p + GROUP) <= from.depth {
+        let block = &from.data[2 * p * from.depth_stride + lane..];
+        let mut rows = block.chunks(from.depth_stride);
+        let mut row = || rows.next().and_then(<[f32]>::first_chunk);
+        for column in &mut columns {
+            let (even, odd) = (row(), row());
+            let (even, odd) = even.zip(odd).expect("the depth is there");
+            // SAFETY: 16 pairs are a vector.
+            *column = unsafe { transmute::<[u32; GROUP], __m512i>(interleave(even, odd)) };
+        }
+        return turn(columns);
+    }
     for (i, column) in columns.iter_mut().enumerate() {
         // SAFETY: 16 pairs are a vector.
         *column = unsafe { transmute::<[u32; GROUP], __m512i>(pairs_across(from, lane, p + i)) };

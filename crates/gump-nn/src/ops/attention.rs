@@ -106,16 +106,7 @@ pub fn causal_self_attention(qkv: &Tensor, n_heads: usize) -> Result<Tensor> {
         );
     }
     let c = width / 3;
-    let view = View {
-        b,
-        tq: t,
-        tk: t,
-        n_heads,
-        d: c / n_heads,
-        causal_offset: Some(0),
-        key_lengths: None,
-        strides: [3 * c; 2],
-    };
+    let view = View::of_thirds([b, t, c], n_heads);
     if fusible(&[qkv]) {
         return qkv.contiguous()?.apply_op1(Attention::new(view));
     }
@@ -222,6 +213,36 @@ impl View {
         })
     }
 
+    /// Causal, of queries, keys and values side by side, `[B, T, 3C]`; `n_heads` divides `c`.
+    pub(super) fn of_thirds([b, t, c]: [usize; 3], n_heads: usize) -> Self {
+        Self {
+            b,
+            tq: t,
+            tk: t,
+            n_heads,
+            d: c / n_heads,
+            causal_offset: Some(0),
+            key_lengths: None,
+            strides: [3 * c; 2],
+        }
+    }
+
+    /// Every one of `rows` queries of a batch entry sees every key of `[B, Tk, C]`; `n_heads`
+    /// divides `C`.
+    pub(super) fn of_keys(keys: &Tensor, rows: usize, n_heads: usize) -> Result<Self> {
+        let (b, tk, c) = keys.dims3()?;
+        Ok(Self {
+            b,
+            tq: rows,
+            tk,
+            n_heads,
+            d: c / n_heads,
+            causal_offset: None,
+            key_lengths: None,
+            strides: [c; 2],
+        })
+    }
+
     fn scale(&self) -> f32 {
         1.0 / (self.d.max(1) as f32).sqrt()
     }
@@ -255,7 +276,8 @@ const SCORES: usize = 64 * 1024;
 /// Multiplications below which sharing out costs more than it saves: microseconds. Not tuned.
 const TASK_PRODUCTS: usize = 64 * 1024;
 
-struct Attention {
+/// Attention over tensors of one shape.
+pub(super) struct Attention {
     view: View,
     operands: Operands,
     /// Logarithm of the softmax sum of each row, `[B, H, Tq]`, kept for the gradient.
@@ -263,7 +285,7 @@ struct Attention {
 }
 
 impl Attention {
-    fn new(view: View) -> Self {
+    pub(super) fn new(view: View) -> Self {
         Self {
             view,
             operands: Operands::current(),
@@ -272,7 +294,7 @@ impl Attention {
     }
 
     /// The result `[B, Tq, C]`; the three slices begin at their first rows.
-    fn forward(&self, inputs: [&[f32]; 3]) -> Vec<f32> {
+    pub(super) fn forward(&self, inputs: [&[f32]; 3]) -> Vec<f32> {
         let &View {
             b, tq, n_heads, d, ..
         } = &self.view;
@@ -330,7 +352,7 @@ impl Attention {
         [dq, dk, dv]
     }
 
-    fn kept_log_sums(&self) -> &[f32] {
+    pub(super) fn kept_log_sums(&self) -> &[f32] {
         self.log_sums.get().expect("forward ran before backward")
     }
 }
@@ -371,7 +393,7 @@ impl CustomOp3 for Attention {
             Host::new(&d_out)?,
         ];
         let [q_all, k_all, v_all, out, d_out] = &hosts;
-        let [dq, dk, dv] = self.backward(&Inputs {
+        let [dq, dk, dv] = self.gradients(&Inputs {
             q: q_all.slice()?,
             k: k_all.slice()?,
             v: v_all.slice()?,
@@ -379,18 +401,10 @@ impl CustomOp3 for Attention {
             d_out: d_out.slice()?,
             log_sums: self.kept_log_sums(),
         });
-        let &View {
-            tq, tk, n_heads, d, ..
-        } = &self.view;
-        let joined = |heads: &[f32], t: usize, like: &Tensor| {
-            let mut out = vec![0.0; heads.len()];
-            interleave(&mut out, [heads], (n_heads, t, d));
-            gradient(out, like).map(Some)
-        };
         Ok((
-            joined(&dq, tq, q)?,
-            joined(&dk, tk, k)?,
-            joined(&dv, tk, v)?,
+            Some(gradient(dq, q)?),
+            Some(gradient(dk, k)?),
+            Some(gradient(dv, v)?),
         ))
     }
 }
@@ -406,47 +420,71 @@ impl CustomOp1 for Attention {
         let &View {
             b, tq, n_heads, d, ..
         } = &self.view;
-        let c = n_heads * d;
-        let out = if qkv.is_empty() {
-            Vec::new()
-        } else {
-            self.forward([qkv, &qkv[c..], &qkv[2 * c..]])
-        };
-        Ok(output(out, (b, tq, c)))
+        Ok(output(self.of_thirds(qkv), (b, tq, n_heads * d)))
     }
 
     fn bwd(&self, qkv: &Tensor, out: &Tensor, d_out: &Tensor) -> Result<Option<Tensor>> {
         let d_out = d_out.contiguous()?;
         let hosts = [Host::new(qkv)?, Host::new(out)?, Host::new(&d_out)?];
         let [all, out, d_out] = &hosts;
-        let all = all.slice::<f32>()?;
+        let joined = self.thirds_gradient(all.slice()?, out.slice()?, d_out.slice()?);
+        Ok(Some(gradient(joined, qkv)?))
+    }
+}
+
+impl Attention {
+    /// The result `[B, T, C]` of queries, keys and values side by side, `[B, T, 3C]`.
+    pub(super) fn of_thirds(&self, qkv: &[f32]) -> Vec<f32> {
+        let c = self.view.n_heads * self.view.d;
+        if qkv.is_empty() {
+            return Vec::new();
+        }
+        self.forward([qkv, &qkv[c..], &qkv[2 * c..]])
+    }
+
+    /// The gradient of [`Self::of_thirds`].
+    pub(super) fn thirds_gradient(&self, qkv: &[f32], out: &[f32], d_out: &[f32]) -> Vec<f32> {
         let &View { tq, n_heads, d, .. } = &self.view;
         let c = n_heads * d;
-        let mut joined = vec![0.0; all.len()];
-        if !all.is_empty() {
+        let mut joined = vec![0.0; qkv.len()];
+        if !qkv.is_empty() {
             let thirds = self.backward(&Inputs {
-                q: all,
-                k: &all[c..],
-                v: &all[2 * c..],
-                out: out.slice()?,
-                d_out: d_out.slice()?,
+                q: qkv,
+                k: &qkv[c..],
+                v: &qkv[2 * c..],
+                out,
+                d_out,
                 log_sums: self.kept_log_sums(),
             });
             let thirds = thirds.each_ref().map(Vec::as_slice);
             interleave(&mut joined, thirds, (n_heads, tq, d));
         }
-        Ok(Some(gradient(joined, qkv)?))
+        joined
+    }
+
+    /// Gradients of queries, keys and values, which lie apart.
+    pub(super) fn gradients(&self, inputs: &Inputs<'_>) -> [Vec<f32>; 3] {
+        let &View {
+            tq, tk, n_heads, d, ..
+        } = &self.view;
+        let parts = self.backward(inputs);
+        let [dq, dk, dv] = parts.each_ref();
+        [(dq, tq), (dk, tk), (dv, tk)].map(|(heads, t)| {
+            let mut out = vec![0.0; heads.len()];
+            interleave(&mut out, [heads.as_slice()], (n_heads, t, d));
+            out
+        })
     }
 }
 
 /// Inputs of the gradient.
-struct Inputs<'a> {
-    q: &'a [f32],
-    k: &'a [f32],
-    v: &'a [f32],
-    out: &'a [f32],
-    d_out: &'a [f32],
-    log_sums: &'a [f32],
+pub(super) struct Inputs<'a> {
+    pub(super) q: &'a [f32],
+    pub(super) k: &'a [f32],
+    pub(super) v: &'a [f32],
+    pub(super) out: &'a [f32],
+    pub(super) d_out: &'a [f32],
+    pub(super) log_sums: &'a [f32],
 }
 
 impl Attention {

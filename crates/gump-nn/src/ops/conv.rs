@@ -1,9 +1,9 @@
 //! Two-dimensional convolution as matrix products.
 //!
-//! What lives here: the fused operation. A band of output rows at a time, the patches under it are
-//! laid out as columns (`[Cin * kh * kw, positions]`) and multiplied by the weights; a band stays
-//! in the second-level cache. A 1 x 1 convolution reads its input in place. What does not:
-//! normalisation and pooling, which the encoder composes.
+//! What lives here: the fused operation. A band of output rows at a time, or several small images at
+//! a time, the patches under it are laid out as columns (`[Cin * kh * kw, positions]`) and multiplied
+//! by the weights. A 1 x 1 convolution reads its input in place. What does not: normalisation and
+//! pooling, which the encoder composes.
 
 use candle_core::{CpuStorage, CustomOp2, CustomOp3, Layout, Result, Shape, Tensor, bail};
 
@@ -15,6 +15,11 @@ use gump_kernels::wide;
 
 /// Column elements of a band: 512 KB, a part of a second-level cache. Not tuned.
 const BAND: usize = 128 * 1024;
+
+/// Positions of a band, at least, where there are as many: the weights are packed, and the sum of
+/// their gradients is read and written, once per band, which for a few positions of a deep layer
+/// costs more than the products. The depth that the kernels of bfloat16 pack at a time.
+const FEW_POSITIONS: usize = 512;
 
 /// Pieces of the batch whose weight gradients are summed apart, each as large as the weights:
 /// bounds the memory and the threads that share the work. Fixed, so that sums do not depend on
@@ -136,21 +141,29 @@ impl Conv {
         (self.kh, self.kw, self.stride, self.padding) == (1, 1, 1, 0)
     }
 
-    /// Threads that work on one image: one per image, or all of them on a lone image.
+    /// Images of a group, whose patches stand side by side in one band: several if they are small.
+    fn group(&self) -> usize {
+        let enough = FEW_POSITIONS.div_ceil(self.positions().max(1));
+        enough.clamp(1, self.b.max(1))
+    }
+
+    /// Threads that work on one group: one per group, or all of them on a lone group.
     fn threads(&self) -> Threads {
-        if self.b == 1 {
+        if self.b <= self.group() {
             Threads::Pool
         } else {
             Threads::One
         }
     }
 
-    /// Output rows per band. A lone image is one band, so that all threads share it.
+    /// Output rows per band. Images of a lone group are one band, so that all threads share it.
     fn band(&self) -> usize {
-        match self.threads() {
-            Threads::Pool => self.out_h,
-            Threads::One => (BAND / (self.patch() * self.out_w)).clamp(1, self.out_h),
+        if self.group() > 1 || self.threads() == Threads::Pool {
+            return self.out_h;
         }
+        let positions = (BAND / self.patch()).max(FEW_POSITIONS);
+        let rows = (positions / self.out_w).clamp(1, self.out_h);
+        self.out_h.div_ceil(self.out_h.div_ceil(rows))
     }
 
     /// Output rows of every band, as (first, count).
@@ -177,11 +190,16 @@ impl Conv {
             .filter(|&y| y < self.h)
     }
 
-    /// Lays out the patches under output rows `first..first + count` as columns.
-    fn gather(&self, x: &[f32], (first, count): (usize, usize), cols: &mut [f32]) {
-        let n = count * self.out_w;
+    /// The image of a group and the output row that line `j` of a band stands for.
+    fn line(&self, (first, count): (usize, usize), j: usize) -> (usize, usize) {
+        (j / count, first + j % count)
+    }
+
+    /// Lays out the patches of `images` under output rows `first..first + count` as columns.
+    fn gather(&self, x: &[f32], images: usize, band: (usize, usize), cols: &mut [f32]) {
+        let n = images * band.1 * self.out_w;
         if (self.kw, self.stride, self.padding) == (4, 4, 0) {
-            return self.gather_fours(x, first, n, cols);
+            return self.gather_fours(x, n, band, cols);
         }
         let rows_per_piece = match self.threads() {
             // Elements per task, as in `gump_kernels::rows`.
@@ -194,7 +212,8 @@ impl Conv {
                 let (ci, ky, kx) = self.tap(tap);
                 let inside = self.inside(kx);
                 for (j, out) in row.chunks_exact_mut(self.out_w).enumerate() {
-                    let Some(y) = self.input_row(first + j, ky) else {
+                    let (image, oy) = self.line(band, j);
+                    let Some(y) = self.input_row(oy, ky) else {
                         out.fill(0.0);
                         continue;
                     };
@@ -203,7 +222,7 @@ impl Conv {
                     if inside.is_empty() {
                         continue;
                     }
-                    let line = &x[(ci * self.h + y) * self.w..][..self.w];
+                    let line = &x[image * self.image() + (ci * self.h + y) * self.w..][..self.w];
                     let line = &line[inside.start * self.stride + kx - self.padding..];
                     let out = &mut out[inside.clone()];
                     if self.stride == 1 {
@@ -220,27 +239,28 @@ impl Conv {
 
     /// [`Self::gather`] of patches that stand side by side and are four wide: a line of pixels is
     /// dealt out to four rows at once.
-    fn gather_fours(&self, x: &[f32], first: usize, n: usize, cols: &mut [f32]) {
+    fn gather_fours(&self, x: &[f32], n: usize, band: (usize, usize), cols: &mut [f32]) {
         let piece = match self.threads() {
             Threads::Pool => 4 * n,
             Threads::One => cols.len(),
         };
         for_pieces(cols, piece, |at, cols| {
             for (i, rows) in cols.chunks_exact_mut(4 * n).enumerate() {
-                self.deal_fours(x, (at * piece / (4 * n) + i, first), rows);
+                self.deal_fours(x, at * piece / (4 * n) + i, band, rows);
             }
         });
     }
 
     /// The four rows of one channel and kernel row.
-    fn deal_fours(&self, x: &[f32], (i, first): (usize, usize), rows: &mut [f32]) {
+    fn deal_fours(&self, x: &[f32], i: usize, band: (usize, usize), rows: &mut [f32]) {
         let n = rows.len() / 4;
         let (ci, ky) = (i / self.kh, i % self.kh);
         let (low, high) = rows.split_at_mut(2 * n);
         let ((a, b), (c, d)) = (low.split_at_mut(n), high.split_at_mut(n));
         for j in 0..n / self.out_w {
-            let y = (first + j) * self.stride + ky;
-            let line = &x[(ci * self.h + y) * self.w..][..4 * self.out_w];
+            let (image, oy) = self.line(band, j);
+            let y = oy * self.stride + ky;
+            let line = &x[image * self.image() + (ci * self.h + y) * self.w..][..4 * self.out_w];
             let out = j * self.out_w..(j + 1) * self.out_w;
             let (a, b) = (&mut a[out.clone()], &mut b[out.clone()]);
             let (c, d) = (&mut c[out.clone()], &mut d[out]);
@@ -257,8 +277,8 @@ impl Conv {
     }
 
     /// Adds columns back to the pixels they came from: the gradient of [`Self::gather`].
-    fn scatter(&self, cols: &[f32], (first, count): (usize, usize), dx: &mut [f32]) {
-        let n = count * self.out_w;
+    fn scatter(&self, cols: &[f32], images: usize, band: (usize, usize), dx: &mut [f32]) {
+        let n = images * band.1 * self.out_w;
         for (tap, row) in cols.chunks_exact(n).enumerate() {
             let (ci, ky, kx) = self.tap(tap);
             let inside = self.inside(kx);
@@ -266,10 +286,12 @@ impl Conv {
                 continue;
             }
             for (j, row) in row.chunks_exact(self.out_w).enumerate() {
-                let Some(y) = self.input_row(first + j, ky) else {
+                let (image, oy) = self.line(band, j);
+                let Some(y) = self.input_row(oy, ky) else {
                     continue;
                 };
-                let line = &mut dx[(ci * self.h + y) * self.w..][..self.w];
+                let start = image * self.image() + (ci * self.h + y) * self.w;
+                let line = &mut dx[start..][..self.w];
                 let line = &mut line[inside.start * self.stride + kx - self.padding..];
                 let row = &row[inside.clone()];
                 if self.stride == 1 {
@@ -289,26 +311,36 @@ impl Conv {
         (rest / self.kh, rest % self.kh, kx)
     }
 
-    /// The columns of a band: gathered into `cols`, or the input itself.
-    fn columns<'a>(&self, x: &'a [f32], band: (usize, usize), cols: &'a mut Vec<f32>) -> Mat<'a> {
-        let n = band.1 * self.out_w;
-        if self.is_pointwise() {
+    /// The columns of a band of `images`: gathered into `cols`, or the input itself.
+    fn columns<'a>(
+        &self,
+        x: &'a [f32],
+        images: usize,
+        band: (usize, usize),
+        cols: &'a mut Vec<f32>,
+    ) -> Mat<'a> {
+        let n = images * band.1 * self.out_w;
+        if self.is_pointwise() && images == 1 {
             Mat::strided(&x[band.0 * self.out_w..], self.c_in, n, self.positions())
         } else {
             cols.resize(self.patch() * n, 0.0);
-            self.gather(x, band, cols);
+            self.gather(x, images, band, cols);
             Mat::new(cols, self.patch(), n)
         }
     }
 
     fn forward(&self, x: &[f32], weight: &[f32], bias: Option<&[f32]>) -> (CpuStorage, Shape) {
         let positions = self.positions();
-        let mut out = vec![0.0; self.b * self.c_out * positions];
-        for_pieces(&mut out, self.c_out * positions, |b, out| {
-            let x = &x[b * self.image()..][..self.image()];
+        let (per_image, group) = (self.c_out * positions, self.group());
+        let mut out = vec![0.0; self.b * per_image];
+        for_pieces(&mut out, group * per_image, |piece, out| {
+            let x = &x[piece * group * self.image()..];
+            let images = out.len() / per_image;
             if let Some(bias) = bias {
-                for (out, bias) in out.chunks_exact_mut(positions).zip(bias) {
-                    out.fill(*bias);
+                for out in out.chunks_exact_mut(per_image) {
+                    for (out, bias) in out.chunks_exact_mut(positions).zip(bias) {
+                        out.fill(*bias);
+                    }
                 }
             }
             let store = if bias.is_some() {
@@ -316,21 +348,49 @@ impl Conv {
             } else {
                 Store::Replace
             };
-            let mut cols = Vec::new();
+            let (mut cols, mut joined) = (Vec::new(), Vec::new());
+            let weight = Mat::new(weight, self.c_out, self.patch());
+            let (threads, operands) = (self.threads(), self.operands);
             for band in self.bands() {
-                let n = band.1 * self.out_w;
-                gemm(
-                    MatMut::strided(&mut out[band.0 * self.out_w..], self.c_out, n, positions),
-                    store,
-                    1.0,
-                    Mat::new(weight, self.c_out, self.patch()),
-                    self.columns(x, band, &mut cols),
-                    self.threads(),
-                    self.operands,
-                );
+                let n = images * band.1 * self.out_w;
+                let cols = self.columns(x, images, band, &mut cols);
+                if images == 1 {
+                    let out = &mut out[band.0 * self.out_w..];
+                    let out = MatMut::strided(out, self.c_out, n, positions);
+                    gemm(out, store, 1.0, weight, cols, threads, operands);
+                } else {
+                    self.join(out, &mut joined);
+                    let y = MatMut::new(&mut joined, self.c_out, n);
+                    gemm(y, store, 1.0, weight, cols, threads, operands);
+                    self.part(&joined, out);
+                }
             }
         });
         output(out, (self.b, self.c_out, self.out_h, self.out_w))
+    }
+
+    /// Lays the outputs of several images `[images, Cout, positions]` side by side,
+    /// `[Cout, images * positions]`.
+    fn join(&self, images: &[f32], joined: &mut Vec<f32>) {
+        let positions = self.positions();
+        joined.clear();
+        for channel in 0..self.c_out {
+            for image in images.chunks_exact(self.c_out * positions) {
+                joined.extend_from_slice(&image[channel * positions..][..positions]);
+            }
+        }
+    }
+
+    /// The inverse of [`Self::join`].
+    fn part(&self, joined: &[f32], images: &mut [f32]) {
+        let positions = self.positions();
+        let width = joined.len() / self.c_out;
+        for (i, image) in images.chunks_exact_mut(self.c_out * positions).enumerate() {
+            let rows = joined.chunks_exact(width);
+            for (to, row) in image.chunks_exact_mut(positions).zip(rows) {
+                to.copy_from_slice(&row[i * positions..][..positions]);
+            }
+        }
     }
 
     /// Gradients of the input and the weights.
@@ -344,7 +404,9 @@ impl Conv {
         let x_all = hosts[0].slice::<f32>()?;
         let w = hosts[1].slice::<f32>()?;
         let dy = hosts[2].slice::<f32>()?;
+        let group = self.group();
         let step = self.b.div_ceil(MAX_PARTIALS).max(1);
+        let step = step.next_multiple_of(group);
         let mut dws = vec![0.0; self.b.div_ceil(step) * w.len()];
         // Without a gradient to the image, one element a piece keeps the two outputs in step.
         let wants_dx = x.track_op();
@@ -354,26 +416,34 @@ impl Conv {
             (&mut dws, w.len()),
             (&mut dx, step * per_image),
             |piece, dw, dx| {
-                let mut cols = Vec::new();
-                for (i, dx) in dx.chunks_exact_mut(per_image).enumerate() {
-                    let b = piece * step + i;
-                    let x = &x_all[b * self.image()..][..self.image()];
-                    let dy = &dy[b * self.c_out * self.positions()..];
+                let (mut cols, mut joined) = (Vec::new(), Vec::new());
+                for (i, dx) in dx.chunks_mut(group * per_image).enumerate() {
+                    let (first, images) = (piece * step + i * group, dx.len() / per_image);
+                    let x = &x_all[first * self.image()..];
+                    let of_image = self.c_out * self.positions();
+                    let dy = &dy[first * of_image..][..images * of_image];
+                    if images > 1 {
+                        self.join(dy, &mut joined);
+                    }
                     for band in self.bands() {
-                        let n = band.1 * self.out_w;
-                        let at = band.0 * self.out_w;
-                        let dy = Mat::strided(&dy[at..], self.c_out, n, self.positions());
+                        let n = images * band.1 * self.out_w;
+                        let dy = if images == 1 {
+                            let dy = &dy[band.0 * self.out_w..];
+                            Mat::strided(dy, self.c_out, n, self.positions())
+                        } else {
+                            Mat::new(&joined, self.c_out, n)
+                        };
                         gemm(
                             MatMut::new(dw, self.c_out, self.patch()),
                             Store::Add,
                             1.0,
                             dy,
-                            self.columns(x, band, &mut cols).t(),
+                            self.columns(x, images, band, &mut cols).t(),
                             self.threads(),
                             self.operands,
                         );
                         if wants_dx {
-                            self.backward_image(w, dy, band, &mut cols, dx);
+                            self.backward_images(w, dy, images, band, &mut cols, dx);
                         }
                     }
                 }
@@ -389,42 +459,28 @@ impl Conv {
         Ok((dx, Some(gradient(dw, weight)?)))
     }
 
-    /// Adds the gradient of one band to that of its image.
-    fn backward_image(
+    /// Adds the gradient of one band to that of its images.
+    fn backward_images(
         &self,
         weight: &[f32],
         dy: Mat<'_>,
+        images: usize,
         band: (usize, usize),
         cols: &mut Vec<f32>,
         dx: &mut [f32],
     ) {
-        let n = band.1 * self.out_w;
+        let n = images * band.1 * self.out_w;
         let weight = Mat::new(weight, self.c_out, self.patch()).t();
-        if self.is_pointwise() {
+        let (threads, operands) = (self.threads(), self.operands);
+        if self.is_pointwise() && images == 1 {
             let dx = &mut dx[band.0 * self.out_w..];
             let dst = MatMut::strided(dx, self.c_in, n, self.positions());
-            gemm(
-                dst,
-                Store::Replace,
-                1.0,
-                weight,
-                dy,
-                self.threads(),
-                self.operands,
-            );
+            gemm(dst, Store::Replace, 1.0, weight, dy, threads, operands);
         } else {
             cols.resize(self.patch() * n, 0.0);
             let dst = MatMut::new(cols, self.patch(), n);
-            gemm(
-                dst,
-                Store::Replace,
-                1.0,
-                weight,
-                dy,
-                self.threads(),
-                self.operands,
-            );
-            self.scatter(cols, band, dx);
+            gemm(dst, Store::Replace, 1.0, weight, dy, threads, operands);
+            self.scatter(cols, images, band, dx);
         }
     }
 
@@ -527,6 +583,11 @@ mod tests {
             [2, 5, 16, 16, 7, 4, 4, 4, 0],
             [2, 32, 60, 60, 8, 3, 3, 1, 1],
             [2, 1, 2, 3, 1, 3, 5, 1, 2],
+            // Several images in a band, the last with fewer; and several bands, the last shorter.
+            [5, 3, 17, 13, 6, 3, 3, 1, 1],
+            [3, 6, 18, 18, 5, 1, 1, 2, 0],
+            [2, 3, 40, 64, 4, 4, 4, 4, 0],
+            [2, 40, 37, 36, 5, 3, 3, 1, 1],
         ] {
             let x = var(&[b, c_in, h, w], 1);
             let (k, bias) = (var(&[c_out, c_in, kh, kw], 2), var(&[c_out], 3));

@@ -32,41 +32,49 @@ impl CustomOp1 for Gelu {
     }
 
     fn cpu_fwd(&self, x: &CpuStorage, layout: &Layout) -> Result<(CpuStorage, Shape)> {
-        let x = elements(x, layout)?;
-        let mut y = vec![0.0; x.len()];
-        for_pieces(&mut y, PIECE, |i, y| {
-            let x = &x[i * PIECE..];
-            wide(
-                #[inline(always)]
-                || {
-                    for (y, &x) in y.iter_mut().zip(x) {
-                        *y = x * normal(x).0;
-                    }
-                },
-            );
-        });
-        Ok(output(y, layout.shape()))
+        Ok(output(activated(elements(x, layout)?), layout.shape()))
     }
 
     fn bwd(&self, x: &Tensor, _y: &Tensor, dy: &Tensor) -> Result<Option<Tensor>> {
         let dy = dy.contiguous()?;
         let (x_host, dy) = (Host::new(x)?, Host::new(&dy)?);
-        let (x_all, dy) = (x_host.slice::<f32>()?, dy.slice::<f32>()?);
-        let mut dx = vec![0.0; x_all.len()];
-        for_pieces(&mut dx, PIECE, |i, dx| {
-            let (x, dy) = (&x_all[i * PIECE..], &dy[i * PIECE..]);
-            wide(
-                #[inline(always)]
-                || {
-                    for ((dx, &x), &dy) in dx.iter_mut().zip(x).zip(dy) {
-                        let (below, density) = normal(x);
-                        *dx = dy * (below + x * density);
-                    }
-                },
-            );
-        });
+        let mut dx = dy.slice::<f32>()?.to_vec();
+        slope(x_host.slice()?, &mut dx);
         Ok(Some(gradient(dx, x)?))
     }
+}
+
+/// The activation of every number.
+pub(super) fn activated(x: &[f32]) -> Vec<f32> {
+    let mut y = vec![0.0; x.len()];
+    for_pieces(&mut y, PIECE, |i, y| {
+        let x = &x[i * PIECE..];
+        wide(
+            #[inline(always)]
+            || {
+                for (y, &x) in y.iter_mut().zip(x) {
+                    *y = x * normal(x).0;
+                }
+            },
+        );
+    });
+    y
+}
+
+/// Turns the gradient of the activations into that of the numbers `x`.
+pub(super) fn slope(x: &[f32], d: &mut [f32]) {
+    for_pieces(d, PIECE, |i, d| {
+        let x = &x[i * PIECE..];
+        wide(
+            #[inline(always)]
+            || {
+                for (d, &x) in d.iter_mut().zip(x) {
+                    let (below, density) = normal(x);
+                    *d *= below + x * density;
+                }
+            },
+        );
+    });
 }
 
 #[cfg(test)]

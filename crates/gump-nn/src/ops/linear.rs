@@ -68,13 +68,15 @@ fn composed(x: &Tensor, weight: &Tensor, bias: Option<&Tensor>) -> Result<Tensor
     y.reshape(shape)
 }
 
-struct Linear {
+/// How products are computed and where the gradients of their matrices go.
+pub(super) struct Linear {
     operands: Operands,
     deferred: Option<Deferred>,
 }
 
 impl Linear {
-    fn now() -> Self {
+    /// As the calling thread has it now.
+    pub(super) fn now() -> Self {
         Self {
             operands: Operands::current(),
             deferred: Deferred::current(),
@@ -111,7 +113,8 @@ impl CustomOp2 for Linear {
         _y: &Tensor,
         dy: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>)> {
-        self.backward(x, weight, &dy.contiguous()?)
+        let (dx, dw) = self.backward(x, weight, &dy.contiguous()?, x.track_op())?;
+        Ok((dx.map(|dx| gradient(dx, x)).transpose()?, dw))
     }
 }
 
@@ -143,16 +146,19 @@ impl CustomOp3 for Linear {
         dy: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
         let dy = dy.contiguous()?;
-        let (dx, dw) = self.backward(x, weight, &dy)?;
-        let db = if bias.track_op() {
-            let dy = Host::new(&dy)?;
-            let db = column_sums(dy.slice()?, bias.dim(0)?);
-            Some(gradient(db, bias)?)
-        } else {
-            None
-        };
-        Ok((dx, dw, db))
+        let (dx, dw) = self.backward(x, weight, &dy, x.track_op())?;
+        let dx = dx.map(|dx| gradient(dx, x)).transpose()?;
+        Ok((dx, dw, bias_gradient(bias, &dy)?))
     }
+}
+
+/// The gradient of a bias, if it has one, from that of the output.
+pub(super) fn bias_gradient(bias: &Tensor, dy: &Tensor) -> Result<Option<Tensor>> {
+    if !bias.track_op() {
+        return Ok(None);
+    }
+    let dy = Host::new(dy)?;
+    gradient(column_sums(dy.slice()?, bias.dim(0)?), bias).map(Some)
 }
 
 impl Linear {
@@ -164,10 +170,21 @@ impl Linear {
         weight_layout: &Layout,
         bias: Option<&[f32]>,
     ) -> Result<(CpuStorage, Shape)> {
-        let (n_out, n_in) = weight_layout.shape().dims2()?;
+        let sizes = weight_layout.shape().dims2()?;
         let mut shape = x_layout.dims().to_vec();
-        *shape.last_mut().expect("x has a last axis") = n_out;
-        let rows = shape[..shape.len() - 1].iter().product();
+        *shape.last_mut().expect("x has a last axis") = sizes.0;
+        Ok(output(self.multiply(x, weight, sizes, bias), shape))
+    }
+
+    /// `x weight^T + bias`, of a matrix `[out, in]` with these sizes.
+    pub(super) fn multiply(
+        &self,
+        x: &[f32],
+        weight: &[f32],
+        (n_out, n_in): (usize, usize),
+        bias: Option<&[f32]>,
+    ) -> Vec<f32> {
+        let rows = x.len() / n_in.max(1);
         let (mut y, store) = match bias {
             Some(bias) => {
                 let mut y = Vec::with_capacity(rows * n_out);
@@ -185,15 +202,17 @@ impl Linear {
             Threads::Pool,
             self.operands,
         );
-        Ok(output(y, shape))
+        y
     }
 
-    fn backward(
+    /// Gradients of the input, if it is wanted, and of the matrix, if it is due now.
+    pub(super) fn backward(
         &self,
         x: &Tensor,
         weight: &Tensor,
         dy: &Tensor,
-    ) -> Result<(Option<Tensor>, Option<Tensor>)> {
+        wants_dx: bool,
+    ) -> Result<(Option<Vec<f32>>, Option<Tensor>)> {
         let (n_out, n_in) = weight.dims2()?;
         let dy_tensor = dy;
         let (x_host, weight_host, dy) = (Host::new(x)?, Host::new(weight)?, Host::new(dy)?);
@@ -201,7 +220,7 @@ impl Linear {
         let dy = dy.slice::<f32>()?;
         let rows = x_all.len() / n_in.max(1);
         let dy = Mat::new(dy, rows, n_out);
-        let dx = if x.track_op() {
+        let dx = if wants_dx {
             let mut dx = vec![0.0; x_all.len()];
             let w = Mat::new(w, n_out, n_in);
             let dst = MatMut::new(&mut dx, rows, n_in);
@@ -214,7 +233,7 @@ impl Linear {
                 Threads::Pool,
                 self.operands,
             );
-            Some(gradient(dx, x)?)
+            Some(dx)
         } else {
             None
         };

@@ -14,30 +14,35 @@
 mod absolute;
 mod attention;
 mod batch_norm;
+mod carried;
 mod conv;
 mod deferred;
 mod divergence;
 mod edge_attention;
 mod gelu;
 mod gru;
+mod half_block;
 mod linear;
 mod loss;
 mod norm;
+mod pool;
 mod table;
 
 pub use absolute::mean_absolute_difference;
 pub use attention::{
     causal_attention, causal_self_attention, cross_attention, cross_attention_padded,
 };
-pub use batch_norm::batch_norm;
+pub use batch_norm::{Then, batch_norm};
 pub use conv::conv2d;
 pub use divergence::{weighted_divergence, weighted_entropy};
 pub use edge_attention::edge_attention;
 pub use gelu::gelu;
 pub use gru::gru;
+pub use half_block::{Affine, Join, Scaling, Seen, attention_half, feed_forward};
 pub use linear::{linear, reduced_linear};
 pub use loss::{Targets, linear_cross_entropy, masked_cross_entropy};
 pub use norm::layer_norm;
+pub use pool::largest_of_nine;
 pub use table::{embedding_sum, table_rows};
 
 pub use deferred::Deferred;

@@ -75,18 +75,7 @@ impl CustomOp3 for LayerNorm {
         let x = elements(x, x_layout)?;
         let weight = elements(weight, weight_layout)?;
         let bias = elements(bias, bias_layout)?;
-        let c = weight.len();
-        let rows = x.len() / c.max(1);
-        let step = rows_per_task(c);
-        let mut y = vec![0.0; x.len()];
-        let mut moments = vec![0.0; rows * 2];
-        for_pieces2((&mut y, step * c), (&mut moments, step * 2), |i, y, m| {
-            let x = &x[i * step * c..];
-            wide(
-                #[inline(always)]
-                || forward_rows(x, weight, bias, self.eps, y, m),
-            );
-        });
+        let (y, moments) = normalized(x, weight, bias, self.eps);
         // A second run of one operation object would store the same moments.
         let _ = self.moments.set(moments);
         Ok(output(y, shape))
@@ -108,44 +97,63 @@ impl CustomOp3 for LayerNorm {
             dy.slice::<f32>()?,
         );
         let moments = self.moments.get().expect("forward ran before backward");
-        let c = w.len();
-        let rows = moments.len() / 2;
-        let step = rows_per_partial(rows, c);
-        let pieces = rows.div_ceil(step);
-        let mut dx = vec![0.0; x_all.len()];
-        let mut dws = vec![0.0; pieces * c];
-        let mut dbs = vec![0.0; pieces * c];
-        for_pieces3(
-            (&mut dx, step * c),
-            (&mut dws, c),
-            (&mut dbs, c),
-            |i, dx, dw, db| {
-                let at = i * step;
-                wide(
-                    #[inline(always)]
-                    || {
-                        backward_rows(
-                            &x_all[at * c..],
-                            w,
-                            &dy[at * c..],
-                            &moments[at * 2..],
-                            dx,
-                            dw,
-                            db,
-                        );
-                    },
-                );
-            },
-        );
-        let (mut dw, mut db) = (vec![0.0; c], vec![0.0; c]);
-        add_partials(&mut dw, &dws);
-        add_partials(&mut db, &dbs);
+        let [dx, dw, db] = gradients(x_all, w, moments, dy);
         Ok((
             Some(gradient(dx, x)?),
             Some(gradient(dw, weight)?),
             Some(gradient(db, bias)?),
         ))
     }
+}
+
+/// The normalised rows, and mean and reciprocal deviation of each, interleaved.
+pub(super) fn normalized(
+    x: &[f32],
+    weight: &[f32],
+    bias: &[f32],
+    eps: f32,
+) -> (Vec<f32>, Vec<f32>) {
+    let c = weight.len();
+    let rows = x.len() / c.max(1);
+    let step = rows_per_task(c);
+    let mut y = vec![0.0; x.len()];
+    let mut moments = vec![0.0; rows * 2];
+    for_pieces2((&mut y, step * c), (&mut moments, step * 2), |i, y, m| {
+        let x = &x[i * step * c..];
+        wide(
+            #[inline(always)]
+            || forward_rows(x, weight, bias, eps, y, m),
+        );
+    });
+    (y, moments)
+}
+
+/// Gradients of the rows, the scale and the shift.
+pub(super) fn gradients(x: &[f32], weight: &[f32], moments: &[f32], dy: &[f32]) -> [Vec<f32>; 3] {
+    let c = weight.len();
+    let rows = moments.len() / 2;
+    let step = rows_per_partial(rows, c);
+    let pieces = rows.div_ceil(step);
+    let mut dx = vec![0.0; x.len()];
+    let mut dws = vec![0.0; pieces * c];
+    let mut dbs = vec![0.0; pieces * c];
+    for_pieces3(
+        (&mut dx, step * c),
+        (&mut dws, c),
+        (&mut dbs, c),
+        |i, dx, dw, db| {
+            let at = i * step;
+            let (x, dy, moments) = (&x[at * c..], &dy[at * c..], &moments[at * 2..]);
+            wide(
+                #[inline(always)]
+                || backward_rows(x, weight, dy, moments, dx, dw, db),
+            );
+        },
+    );
+    let (mut dw, mut db) = (vec![0.0; c], vec![0.0; c]);
+    add_partials(&mut dw, &dws);
+    add_partials(&mut db, &dbs);
+    [dx, dw, db]
 }
 
 #[inline(always)]
