@@ -77,6 +77,9 @@ const LATE: usize = 18;
 const BACK_M: f64 = 0.5;
 const BACKS_UP: usize = 4;
 const WAITS_BACK: usize = 14;
+/// Who goes on in a junction and stops again within so many steps does not wait again: it would creep
+/// through two phases of the lights. Chosen by hand.
+const GOES_ON: usize = 8;
 /// An agent that was faster than this is not parked, metres per second: more than the jitter of
 /// recorded boxes. Chosen by hand (decision 26).
 const DRIVES: f64 = 2.0;
@@ -363,7 +366,8 @@ struct Member {
     could_go: bool,
     /// Steps for which it backs up for others, and waits afterwards.
     backing: usize,
-    /// Steps for which another does so for it.
+    /// Steps for which it does not wait again where it could go: another has backed up for it, or it has
+    /// just begun to.
     let_pass: usize,
     /// Where it means to go.
     intent: Intent,
@@ -663,6 +667,7 @@ impl Future {
                 if member.backing > 0 {
                     continue;
                 }
+                member.let_pass = member.let_pass.max(GOES_ON);
                 member.could_go = true;
                 limits[i] = None;
                 member.seen.restart(engine, START);
@@ -887,7 +892,7 @@ impl Member {
     }
 
     /// Time that it has been idle, seconds. Who backs up still stands in the junction for the others, and
-    /// comes last; whom it lets pass does not wait again.
+    /// comes last; whom it lets pass does not wait again, nor who has begun to go.
     fn idle_s(&self) -> f64 {
         let stands = self.now().velocity().length() < CREEPS;
         let least = match (self.backing > 0, self.let_pass > 0 && stands) {
