@@ -30,9 +30,9 @@ class World:
     predictions of a moment, `redraws` is how often what would run into something or off the road is
     drawn again, `limits` hold back what cannot move so. `raw` is the network alone, `paper` the
     paper's decoding, `spawn` lets agents come and leave, as many as at the start. `lights` is what
-    traffic lights show: "model", what signals of such junctions do, or "hold". `routes` is when vehicles of the relative network are
-    given routes, which they keep: "never", "late" (after nine seconds) or "always". `mode` is "partial-ar" or
-    "full-ar", `precision` "f32", "bf16" or "int8".
+    traffic lights show: "model", what signals of such junctions do, or "hold". `routes` is when
+    vehicles of the relative network are given routes, which they keep: "never", "late" (after nine
+    seconds) or "always". `mode` is "partial-ar" or "full-ar", `precision` "f32", "bf16" or "int8".
 
     Raises `ValueError` for another name or a number out of its range, `FileNotFoundError` and
     `DataError` for weights.
