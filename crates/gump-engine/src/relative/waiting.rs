@@ -97,7 +97,7 @@ struct Room {
 }
 
 /// What those may do who have stood for longer than their patience, by index.
-#[derive(Debug, Default, PartialEq, Eq)]
+#[derive(Debug)]
 pub(super) struct Released {
     /// They could go on.
     pub(super) go: Vec<usize>,
@@ -159,8 +159,7 @@ pub(super) fn released(map: &MapGraph, lights: &[Light], agents: &[Standing]) ->
         let (one, other) = (&agents[*i], &agents[*j]);
         let (from, of) = (one.agent.state.pose, other.agent.state.pose);
         let turn = angle_difference(from.heading, of.heading);
-        let is_later = (-one.waited_s, one.agent.id) > (-other.waited_s, other.agent.id);
-        is_later
+        came_later(one, other)
             && turn.abs() > CROSSES
             && from.position.distance(of.position) < MEETING_M
             && meet(own, its)
@@ -174,6 +173,11 @@ pub(super) fn released(map: &MapGraph, lights: &[Light], agents: &[Standing]) ->
         go: next,
         back_up: backing(map, agents, &stuck),
     }
+}
+
+/// Whether an agent has waited less than another; of those that have waited as long the last one has.
+fn came_later(one: &Standing, other: &Standing) -> bool {
+    (-one.waited_s, one.agent.id) > (-other.waited_s, other.agent.id)
 }
 
 /// Whether another vehicle or bicycle stands at an angle to an agent.
@@ -215,12 +219,9 @@ fn backing(map: &MapGraph, agents: &[Standing], stuck: &[usize]) -> Vec<(usize, 
     let could = stuck.iter().copied().filter(|&i| could(i));
     let could = could.map(|i| (i, blocked(i)));
     let could: Vec<_> = could.filter(|(_, others)| !others.is_empty()).collect();
-    let came_later = |one: &Standing, other: &Standing| {
-        apart(&one.agent, &other.agent) < MEETING_M
-            && (-one.waited_s, one.agent.id) > (-other.waited_s, other.agent.id)
-    };
     let is_last = |i: usize| {
-        let mut others = could.iter().filter(|(j, _)| *j != i);
+        let near = |j: usize| apart(&agents[j].agent, &agents[i].agent) < MEETING_M;
+        let mut others = could.iter().filter(|(j, _)| near(*j));
         !others.any(|(j, _)| came_later(&agents[*j], &agents[i]))
     };
     could.iter().filter(|(i, _)| is_last(*i)).cloned().collect()

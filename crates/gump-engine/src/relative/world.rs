@@ -77,8 +77,8 @@ const LATE: usize = 18;
 const BACK_M: f64 = 0.5;
 const BACKS_UP: usize = 4;
 const WAITS_BACK: usize = 14;
-/// Who goes on in a junction and stops again within so many steps does not wait again: it would creep
-/// through two phases of the lights. Chosen by hand.
+/// Who goes on and stops again within so many steps has still waited for ten seconds: in a junction it
+/// goes on at once, where it would creep through two phases of the lights. Chosen by hand (decision 35).
 const GOES_ON: usize = 8;
 /// An agent that was faster than this is not parked, metres per second: more than the jitter of
 /// recorded boxes. Chosen by hand (decision 26).
@@ -311,6 +311,8 @@ pub(super) struct Scene {
     lights: Vec<Light>,
     /// When vehicles are given routes.
     routes: Routes,
+    /// Whether moves are drawn again under the rules.
+    has_rules: bool,
 }
 
 impl Scene {
@@ -347,6 +349,7 @@ impl Scene {
             ego,
             lights: lights.to_vec(),
             routes: sampling.routes,
+            has_rules: sampling.redraws > 0,
         }
     }
 }
@@ -654,7 +657,8 @@ impl Future {
             });
             let all: Vec<_> = members.chain(others).collect();
             let released = released(map, &self.lights, &all);
-            for (i, blocked) in released.back_up {
+            let backs_up = released.back_up.into_iter();
+            for (i, blocked) in backs_up.filter(|_| self.scene.has_rules) {
                 self.members[i].backing = BACKS_UP + WAITS_BACK;
                 for j in blocked {
                     if let Some(member) = self.members.get_mut(j) {
@@ -768,8 +772,9 @@ impl Future {
     fn back_up(&self, moves: &mut [Pose]) {
         let backing = self.members.iter().enumerate();
         for (i, member) in backing.filter(|(_, member)| member.backing > 0) {
-            let everybody = self.members.iter().map(|member| &member.agent);
-            let backs = member.backing > WAITS_BACK && has_room_behind(&member.agent, everybody);
+            let members = self.members.iter().map(|member| &member.agent);
+            let all = members.chain(&self.others);
+            let backs = member.backing > WAITS_BACK && has_room_behind(&member.agent, all);
             moves[i] = match backs {
                 true => Pose::new(-BACK_M, 0.0, 0.0),
                 false => Pose::IDENTITY,
