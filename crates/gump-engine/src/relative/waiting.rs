@@ -64,6 +64,11 @@ const MOVES: f64 = 0.5;
 /// In a junction patience is at most this, seconds, longer than a benchmark of 8 s shows: who stands
 /// there stands in the way. Vehicles that hold each other there squeeze past at once.
 const INSIDE_S: f64 = 9.0;
+/// After a benchmark's time it is at most this, seconds, for who drove in by a light that is green no
+/// more: the next phase is about to come.
+pub(super) const CLEARS_S: f64 = 1.0;
+/// A way to a place in a junction has at most so many lanes from its light on.
+const HOPS: usize = 4;
 /// One that does not squeeze past by then backs up, seconds, ...
 const STUCK_S: f64 = 12.0;
 /// ... if there is so much room behind it, and so much beside that, metres.
@@ -113,10 +118,18 @@ pub(super) struct Released {
 /// in a junction at once, less room suffices between vehicles that stand across each other's paths.
 /// In a junction, where even that is missing for [`STUCK_S`], the vehicle that came last backs up.
 /// A pedestrian could if it stands on the path of a vehicle or bicycle that has waited as long.
-/// `agents` are all of the frame.
-pub(super) fn released(map: &MapGraph, lights: &[Light], agents: &[Standing]) -> Released {
-    let is_patient = |one: &Standing| one.patience_s.is_infinite() || one.waited_s <= INSIDE_S;
-    let inside = |one: &Standing| !is_patient(one) && is_inside(map, one);
+/// `agents` are all of the frame. If it `is_late`, those clear a junction whose light has changed.
+pub(super) fn released(
+    map: &MapGraph,
+    lights: &[Light],
+    agents: &[Standing],
+    is_late: bool,
+) -> Released {
+    let inside = |one: &Standing| match one.waited_s {
+        _ if one.patience_s.is_infinite() => false,
+        waited if waited > INSIDE_S => is_inside(map, one),
+        waited => is_late && waited > CLEARS_S && has_to_clear(map, lights, one),
+    };
     let inside: Vec<bool> = agents.iter().map(inside).collect();
     let waits = |i: &usize| inside[*i] || agents[*i].waited_s > agents[*i].patience_s;
     let waiting: Vec<usize> = (0..agents.len()).filter(waits).collect();
@@ -254,6 +267,30 @@ fn is_inside(map: &MapGraph, one: &Standing) -> bool {
     near.next().is_some_and(|(lane, _)| lane.in_intersection)
 }
 
+/// Whether an agent was driving and is on a lane of a junction whose light has ended its green.
+fn has_to_clear(map: &MapGraph, lights: &[Light], one: &Standing) -> bool {
+    if !one.has_driven || lights.is_empty() {
+        return false;
+    }
+    let state_of = |lane: &Lane| lights.iter().find(|light| light.lane == lane.id);
+    let mut lane = ahead(map, one).first().map(|part| part.lane);
+    // The light belongs to the lane that leads in, or to the first one inside.
+    for hop in 0..HOPS {
+        let Some(here) = lane else {
+            break;
+        };
+        if hop == 0 && !here.in_intersection {
+            return false;
+        }
+        if let Some(light) = state_of(here) {
+            return matches!(light.state, LightState::Red | LightState::Yellow);
+        }
+        lane = map.predecessors(here.id).next();
+        lane = lane.filter(|_| here.in_intersection);
+    }
+    false
+}
+
 /// Whether two agents' lanes ahead come within [`NEAR_PATH_M`] of each other.
 fn meet(own: &[LaneAhead<'_>], its: &[LaneAhead<'_>]) -> bool {
     let on_own = |point: DVec2| {
@@ -356,6 +393,18 @@ fn holds(
         return false;
     }
     let beside = NEAR_PATH_M + other.width / 2.0;
+    // It drives along the path ahead.
+    let leads = reached.iter().any(|part| {
+        let place = part.locate(at);
+        let way = &part.lane.centerline;
+        let way = way.pose_at(way.project(at).arc_length).heading;
+        place.beside_m <= IN_LANE_M
+            && (0.0..LOOK_M).contains(&place.ahead_m)
+            && angle_difference(way, pose.heading).abs() < ALONG
+    });
+    if leads {
+        return false;
+    }
     let steps = (GAP_S * 2.0) as usize;
     (1..=steps).any(|k| is_ahead(at + velocity * (0.5 * k as f64), beside, LOOK_M))
 }
@@ -385,7 +434,7 @@ mod tests {
                 has_driven,
             })
             .collect();
-        let found = released(scene.map, scene.now().lights(), &agents);
+        let found = released(scene.map, scene.now().lights(), &agents, false);
         found.go.into_iter().map(|i| agents[i].agent.id.0).collect()
     }
 
@@ -511,13 +560,55 @@ mod tests {
                 has_driven: true,
             };
             let agents: Vec<_> = scene.now().agents().iter().map(standing).collect();
-            released(&MapGraph::new(parts).unwrap(), &[], &agents).go
+            released(&MapGraph::new(parts).unwrap(), &[], &agents, false).go
         };
         // They hold each other, 0.2 m beside their paths.
         assert_eq!(go(true, 9.5, 20.0), [0]);
         assert!(go(false, 9.5, 20.0).is_empty() && go(true, 8.5, 20.0).is_empty());
         // One that is driven from outside is not released.
         assert!(go(true, 9.5, f64::INFINITY).is_empty());
+    }
+
+    #[test]
+    fn who_waits_in_a_junction_clears_it_when_its_light_has_changed() {
+        // It waits on the second lane inside, behind the light's.
+        let go = |rest: &str, waited_s: f64, is_late: bool| {
+            let scenario = scenario(&format!(
+                "lane 1: 0,0 20,0 next 2\nlane 2: 20,0 24,0 next 3\nlane 3: 24,0 50,0 next 4\n\
+                 lane 4: 50,0 90,0\nego vehicle 0: 30,0\n{rest}"
+            ));
+            let mut parts = scenario.map.parts().clone();
+            for lane in [1, 2] {
+                parts.lanes[lane].in_intersection = true;
+            }
+            let standing = |agent: &Agent| Standing {
+                agent: *agent,
+                waited_s: if agent.id.0 == 0 { waited_s } else { 0.0 },
+                patience_s: 20.0,
+                has_driven: true,
+            };
+            let scene = scenario.present();
+            let agents: Vec<_> = scene.now().agents().iter().map(standing).collect();
+            let map = MapGraph::new(parts).unwrap();
+            released(&map, scene.now().lights(), &agents, is_late).go
+        };
+        for (lane, state, goes) in [
+            (2, "red", true),
+            (2, "yellow", true),
+            (2, "green", false),
+            (1, "red", true),
+            (4, "red", false),
+        ] {
+            let light = format!("light {lane} {state}: {},0", 20 * lane - 20);
+            assert_eq!(go(&light, 1.5, true), [0][..usize::from(goes)], "{light}");
+        }
+        let red = "light 2 red: 20,0";
+        assert!(go(red, 1.0, true).is_empty() && go(red, 1.5, false).is_empty());
+        let crosses = "agent vehicle 1: 40,-20 heading 1.5708 velocity 0,8";
+        assert!(go(&format!("{red}\n{crosses}"), 1.5, true).is_empty());
+        // One that has turned into the same road before it does not cross.
+        let leads = "agent vehicle 1: 44,0.5 heading 0.2 velocity 5,1";
+        assert_eq!(go(&format!("{red}\n{leads}"), 1.5, true), [0]);
     }
 
     #[test]
@@ -540,7 +631,7 @@ mod tests {
             };
             let scene = scenario.present();
             let agents: Vec<_> = scene.now().agents().iter().map(standing).collect();
-            let released = released(&MapGraph::new(parts).unwrap(), &[], &agents);
+            let released = released(&MapGraph::new(parts).unwrap(), &[], &agents, false);
             assert!(released.go.is_empty(), "{released:?}");
             let back_up = released.back_up.iter();
             back_up.map(|(i, _)| *i).collect::<Vec<_>>()

@@ -38,7 +38,7 @@ use crate::relative::rules::{
     Driven, Known, Shut, StopLine, kinematically_limited, obey_lines, resolve, start,
 };
 use crate::relative::seen::{FrameIndex, ObservedAgent, add_presents};
-use crate::relative::waiting::{Standing, has_room_behind, released};
+use crate::relative::waiting::{CLEARS_S, Standing, has_room_behind, released};
 use crate::sampling::{Routes, SamplingConfig};
 
 pub use live::LiveFuture;
@@ -628,6 +628,7 @@ impl Future {
     /// Limits for how long agents are shown to the network as standing. One that is driven from
     /// outside is shown as it is, and keeps none of those waiting that could go.
     fn limit_waiting(&mut self, engine: &RelativeEngine, driven: Option<AgentId>) {
+        let is_late = self.is_late();
         let map = &self.scene.source;
         let mut limits = Vec::with_capacity(self.members.len());
         let mut is_one_waiting = false;
@@ -635,7 +636,7 @@ impl Future {
             member.could_go = false;
             member.backing = member.backing.saturating_sub(1);
             member.let_pass = member.let_pass.saturating_sub(1);
-            is_one_waiting |= member.idle_s() > PATIENCE_S[0];
+            is_one_waiting |= member.idle_s() > if is_late { CLEARS_S } else { PATIENCE_S[0] };
             let is_long = member.waited > WAITED_S && stands_in_lane(map, &member.agent);
             limits.push(is_long.then_some(WAITED_S));
         }
@@ -656,7 +657,7 @@ impl Future {
                 has_driven: false,
             });
             let all: Vec<_> = members.chain(others).collect();
-            let released = released(map, &self.lights, &all);
+            let released = released(map, &self.lights, &all, is_late);
             let backs_up = released.back_up.into_iter();
             for (i, blocked) in backs_up.filter(|_| self.scene.has_rules) {
                 self.members[i].backing = BACKS_UP + WAITS_BACK;
