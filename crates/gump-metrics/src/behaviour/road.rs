@@ -10,6 +10,9 @@ const LOOK_S: f64 = 0.5;
 /// A vehicle has left the road when its centre is this far beyond the road's edge, metres: more than
 /// half of it is beside the road. Less is a kerb or a map that is inaccurate. Chosen by hand.
 const BEYOND_M: f64 = 0.5;
+/// A vehicle this near to the centre of a lane is on the road, metres, wherever its edge is drawn: at the
+/// ends of some networks of SUMO the edge leaves out the lanes that turn back. Chosen by hand.
+const ON_LANE_M: f64 = 1.0;
 
 impl Counter<'_> {
     /// Nothing is counted on maps without a border.
@@ -48,6 +51,11 @@ impl Counter<'_> {
             let z = agent.elevation - agent.height / 2.0;
             let Some(beyond) = metres_off_road(self.map, pose.position, z) else {
                 return (exits, n_moving);
+            };
+            let mut lanes = self.map.lanes_near(pose.position, ON_LANE_M);
+            let beyond = match lanes.next() {
+                Some(_) => 0.0,
+                None => beyond,
             };
             if k > self.take.now {
                 n_moving += 1;

@@ -495,6 +495,9 @@ fn who_drives_over_the_edge_leaves_the_road_once() {
     };
     check(border, 0.0, |_| 0.0, 0.0);
     check(border, 0.0, |t| t, 1.0);
+    // Along a lane that the edge leaves out.
+    let turn = format!("{border}lane 50: 30,0 80,-10\n");
+    check(&turn, 0.0, |t| t, 0.0);
     // On the kerb; and off the road, back to the kerb and off again.
     check(border, 0.0, |t| t.min(4.4), 0.0);
     let kerb = |t: f64| {
