@@ -41,6 +41,14 @@ const GENTLY: f64 = 4.0;
 /// of standing at 14 m/s is rare, but would stop a car within its own length.
 const GRIP_MPS2: f64 = 8.0;
 
+/// A vehicle's rear axle is this far behind its centre, metres, ...
+const AXLE_M: f64 = 1.4;
+/// ... and slides at most this far in a step, metres, and metres per metre ahead: as 99 to 99.9 % of
+/// recorded vehicles that move over 2 m. Slower ones slide farther in SUMO, which turns vehicles about
+/// their fronts (result 39).
+const SLIDES_M: (f64, f64) = (0.1, 0.03);
+const SLIDES_SLOW_M: (f64, f64) = (0.75, 0.1);
+
 /// Beyond the place where it could stop, a vehicle looks this far for a junction, metres.
 const LOOK_M: f64 = 2.0;
 
@@ -56,7 +64,7 @@ pub(super) fn kinematically_limited(now: &Shown, step: Pose) -> Pose {
     let Some(limits) = Limits::of(now.body.kind) else {
         return step;
     };
-    let step = with_grip(now, step);
+    let step = without_sliding(now, with_grip(now, step));
     let moved = AgentState {
         pose: now.pose * step,
         velocity: step.position / TOKEN_DT,
@@ -81,6 +89,23 @@ fn with_grip(now: &Shown, step: Pose) -> Pose {
         heading: 0.0,
     };
     on.interpolate(step, most / change)
+}
+
+/// The same move of a vehicle with the heading of one that does not slide: its rear axle follows the mean
+/// of its headings, up to [`SLIDES_M`]. Where it goes stays as drawn; a network that sees itself slide
+/// along its lane goes on to the road's edge, one that sees itself turned steers back.
+fn without_sliding(now: &Shown, step: Pose) -> Pose {
+    let ahead = step.position.x;
+    if now.body.kind != AgentKind::Vehicle || ahead <= 0.0 {
+        return step;
+    }
+    let lever = 0.5 * ahead + AXLE_M;
+    let slides = step.position.y - lever * step.heading;
+    let most = (SLIDES_M.0 + SLIDES_M.1 * ahead).max(SLIDES_SLOW_M.0 - SLIDES_SLOW_M.1 * ahead);
+    Pose {
+        heading: step.heading + (slides - slides.clamp(-most, most)) / lever,
+        ..step
+    }
 }
 
 /// The line at which a light stops vehicles.
@@ -715,6 +740,24 @@ mod tests {
         assert!(kept.position.y < 0.5 && kept.heading < 0.3, "{kept:?}");
         let fine = Pose::new(4.0, 0.1, 0.05);
         assert_eq!(kinematically_limited(&car(0.0, 4.0), fine), fine);
+    }
+
+    #[test]
+    fn who_moves_sideways_is_turned() {
+        // One metre to the side at 16 m/s, heading along the road.
+        let kept = kinematically_limited(&car(0.0, 8.0), Pose::new(8.0, 1.0, 0.0));
+        assert_eq!(kept.position, DVec2::new(8.0, 1.0));
+        assert!((kept.heading - (1.0 - 0.34) / 5.4).abs() < 1e-9, "{kept:?}");
+        // It would turn to the left, but goes to the right.
+        let kept = kinematically_limited(&car(0.0, 8.0), Pose::new(8.0, -0.5, 0.1));
+        assert!(kept.heading < 0.0, "{kept:?}");
+        // A turn at 4 m/s, about its front; and a person walks as it likes.
+        let turn = Pose::new(2.0, 0.6, 0.4);
+        assert_eq!(kinematically_limited(&car(0.0, 2.0), turn), turn);
+        let mut person = car(0.0, 1.0);
+        person.body.kind = AgentKind::Pedestrian;
+        let aside = Pose::new(0.5, 0.8, 0.0);
+        assert_eq!(kinematically_limited(&person, aside), aside);
     }
 
     #[test]
