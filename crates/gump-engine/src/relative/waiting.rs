@@ -272,23 +272,16 @@ fn has_to_clear(map: &MapGraph, lights: &[Light], one: &Standing) -> bool {
     if !one.has_driven || lights.is_empty() {
         return false;
     }
-    let state_of = |lane: &Lane| lights.iter().find(|light| light.lane == lane.id);
-    let mut lane = ahead(map, one).first().map(|part| part.lane);
+    let lane = ahead(map, one).first().map(|part| part.lane);
+    let inside = lane.filter(|lane| lane.in_intersection);
     // The light belongs to the lane that leads in, or to the first one inside.
-    for hop in 0..HOPS {
-        let Some(here) = lane else {
-            break;
-        };
-        if hop == 0 && !here.in_intersection {
-            return false;
-        }
-        if let Some(light) = state_of(here) {
-            return matches!(light.state, LightState::Red | LightState::Yellow);
-        }
-        lane = map.predecessors(here.id).next();
-        lane = lane.filter(|_| here.in_intersection);
-    }
-    false
+    let way_in = std::iter::successors(inside, |lane| match lane.in_intersection {
+        true => map.predecessors(lane.id).next(),
+        false => None,
+    });
+    let light_of = |lane: &Lane| lights.iter().find(|light| light.lane == lane.id);
+    let light = way_in.take(HOPS).find_map(light_of);
+    light.is_some_and(|light| matches!(light.state, LightState::Red | LightState::Yellow))
 }
 
 /// Whether two agents' lanes ahead come within [`NEAR_PATH_M`] of each other.

@@ -629,6 +629,7 @@ impl Future {
     /// outside is shown as it is, and keeps none of those waiting that could go.
     fn limit_waiting(&mut self, engine: &RelativeEngine, driven: Option<AgentId>) {
         let is_late = self.is_late();
+        let shortest = if is_late { CLEARS_S } else { PATIENCE_S[0] };
         let map = &self.scene.source;
         let mut limits = Vec::with_capacity(self.members.len());
         let mut is_one_waiting = false;
@@ -636,7 +637,7 @@ impl Future {
             member.could_go = false;
             member.backing = member.backing.saturating_sub(1);
             member.let_pass = member.let_pass.saturating_sub(1);
-            is_one_waiting |= member.idle_s() > if is_late { CLEARS_S } else { PATIENCE_S[0] };
+            is_one_waiting |= member.idle_s() > shortest;
             let is_long = member.waited > WAITED_S && stands_in_lane(map, &member.agent);
             limits.push(is_long.then_some(WAITED_S));
         }

@@ -1,5 +1,7 @@
 //! Leaving the road.
 
+use gump_scene::LaneKind;
+
 use super::track::Track;
 use super::{Class, Counter, MOVES, Measure, vehicles};
 use crate::metres_off_road;
@@ -10,7 +12,7 @@ const LOOK_S: f64 = 0.5;
 /// A vehicle has left the road when its centre is this far beyond the road's edge, metres: more than
 /// half of it is beside the road. Less is a kerb or a map that is inaccurate. Chosen by hand.
 const BEYOND_M: f64 = 0.5;
-/// A vehicle this near to the centre of a lane is on the road, metres, wherever its edge is drawn: at the
+/// A vehicle this near to the centre of a lane that is not for bicycles is on the road, metres, wherever its edge is drawn: at the
 /// ends of some networks of SUMO the edge leaves out the lanes that turn back. Chosen by hand.
 const ON_LANE_M: f64 = 1.0;
 
@@ -53,10 +55,8 @@ impl Counter<'_> {
                 return (exits, n_moving);
             };
             let mut lanes = self.map.lanes_near(pose.position, ON_LANE_M);
-            let beyond = match lanes.next() {
-                Some(_) => 0.0,
-                None => beyond,
-            };
+            let is_on_lane = lanes.any(|(lane, _)| lane.kind != LaneKind::BikeLane);
+            let beyond = if is_on_lane { 0.0 } else { beyond };
             if k > self.take.now {
                 n_moving += 1;
                 if was_on && beyond > BEYOND_M {
