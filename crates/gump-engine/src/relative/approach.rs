@@ -1,4 +1,4 @@
-//! What a vehicle comes to on its lane: lines at which it stops, and the lane itself.
+//! What a vehicle comes to on its lane: lines at which it stops, bends, and the lane itself.
 //!
 //! Used by the rules of sampling (`right_of_way`, `keep_clear`) and by training, which judges drives.
 
@@ -6,8 +6,9 @@ use std::f64::consts::FRAC_PI_6;
 
 use gump_geometry::{Pose, angle_difference};
 use gump_model::relative::graph::Shown;
+use gump_model::relative::route::Route;
 use gump_model::steps::TOKEN_DT;
-use gump_scene::{Lane, MapGraph};
+use gump_scene::{BendLimits, Lane, MapGraph, approach_speed};
 
 // All were chosen by hand.
 
@@ -24,6 +25,15 @@ pub const OVER_M: f64 = 0.5;
 /// Drivers roll past stop signs at this speed at most, metres per second: hardly a recorded one is faster
 /// at the line.
 pub const ROLLS_MPS: f64 = 2.5;
+/// How drivers take bends: 99.8 % of the steps of recorded vehicles over 3 m/s on lanes are slower, 99.2 to
+/// 99.4 % of SUMO's (result 40).
+const BENDS: BendLimits = BendLimits {
+    lateral_mps2: 5.0,
+    braking_mps2: 4.0,
+    ahead_m: 40.0,
+};
+/// A slower vehicle can take any bend, metres per second.
+const SLOW_MPS: f64 = 3.0;
 
 /// The greatest speed of a vehicle before a line that it crosses at `least` metres per second at most;
 /// infinite if it is over the line, or too fast to get there.
@@ -46,6 +56,24 @@ pub fn slowing_before(now: &Shown, metres: f64, least: f64) -> f64 {
     let squared = (2.0 * room + least * least / BRAKES_MPS2) / BRAKES_MPS2;
     let speed = BRAKES_MPS2 * ((TOKEN_DT * TOKEN_DT + squared).sqrt() - TOKEN_DT);
     speed.max(least)
+}
+
+/// The greatest speed from which a vehicle can take the bends ahead, metres per second: those of its route
+/// where it is on it, else those of the fastest way from the lanes that it may be on. Infinite on none.
+pub fn speed_for_bends(streets: &MapGraph, now: &Shown, route: Option<&Route>) -> f64 {
+    if now.velocity().length() < SLOW_MPS {
+        return f64::INFINITY;
+    }
+    let along = |route: Option<&Route>| {
+        let is_meant = |lane: &Lane| route.is_none_or(|route| route.lanes().contains(&lane.id));
+        let entering = |lane: &Lane, _| if is_meant(lane) { f64::INFINITY } else { 0.0 };
+        lanes_under(streets, now.pose)
+            .filter(|(lane, ..)| is_meant(lane))
+            .map(|(lane, at, _)| approach_speed(streets, lane, at, BENDS, &entering))
+            .reduce(f64::max)
+    };
+    let meant = route.and_then(|route| along(Some(route)));
+    meant.or_else(|| along(None)).unwrap_or(f64::INFINITY)
 }
 
 /// Whether a stop sign applies to a lane: at its start if it is in a junction, at its end otherwise.

@@ -17,7 +17,7 @@ use gump_scene::{
 
 use crate::kinematic_limits::Limits;
 use crate::rejection::{BRAKING, Footprints, Member, POSES, Way, way};
-use crate::relative::approach::{HARDEST_MPS2, OVER_M};
+use crate::relative::approach::{HARDEST_MPS2, OVER_M, speed_for_bends};
 use crate::relative::keep_clear::closed_entry;
 use crate::relative::right_of_way::{Course, courses, speed_for_signs, yielding_speed};
 
@@ -220,8 +220,8 @@ pub(super) struct Shut<'l> {
     lights: Vec<(&'l StopLine, LightState)>,
     /// Those before occupied junctions, by agent.
     entries: Vec<Option<StopLine>>,
-    /// The greatest speed for those that have the right of way and for stop signs, by agent, metres per
-    /// second.
+    /// The greatest speed for those that have the right of way, for stop signs and for bends, by agent,
+    /// metres per second.
     most: Vec<f64>,
 }
 
@@ -268,7 +268,11 @@ impl<'l> Shut<'l> {
             let others = ways.iter().enumerate();
             let others = others.filter(|(j, _)| *j != i && !known[*j].is_parked);
             let yielding = yielding_speed(&ways[i], &others.map(|(_, way)| &way[..]));
-            yielding.min(speed_for_signs(&ways[i]))
+            let least = yielding.min(speed_for_signs(&ways[i]));
+            match agents[i].body.kind {
+                AgentKind::Vehicle => least.min(speed_for_bends(map, &agents[i], known[i].route)),
+                _ => least,
+            }
         };
         Self {
             lights: lights.collect(),
@@ -278,7 +282,7 @@ impl<'l> Shut<'l> {
     }
 
     /// Whether an agent crosses one with this move, takes another's right of way or is too fast for a
-    /// stop sign.
+    /// stop sign or a bend.
     pub(super) fn forbids(&self, agents: &[Shown], i: usize, step: Pose) -> bool {
         let now = &agents[i];
         let entry = self.entries[i].as_ref();
@@ -287,7 +291,7 @@ impl<'l> Shut<'l> {
             || step.position.length() / TOKEN_DT > self.at_most(now, i)
     }
 
-    /// The greatest speed of an agent for others and for signs, metres per second: it brakes no harder
+    /// The greatest speed of an agent for others, signs and bends, metres per second: it brakes no harder
     /// than [`GENTLY`].
     fn at_most(&self, now: &Shown, i: usize) -> f64 {
         self.most[i].max(now.velocity().length() - GENTLY * TOKEN_DT)

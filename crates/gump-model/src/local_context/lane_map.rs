@@ -293,54 +293,59 @@ impl LaneMap {
     }
 }
 
-/// Points by cell: the points of cell `i` are `items[starts[i]..starts[i + 1]]`.
+/// Points by cell of a grid that holds all of them: those of cell `i` are `items[starts[i]..starts[i + 1]]`.
 #[derive(Debug, Default)]
 struct Cells {
+    /// The corner of the grid with the least coordinates.
+    corner: DVec2,
+    /// Numbers of cells along x and y; 0 if there is no point.
+    sides: [usize; 2],
     starts: Vec<u32>,
     items: Vec<u32>,
 }
 
 impl Cells {
-    const SIDE: usize = (2.0 * HALF_SIDE_M / CELL_M) as usize;
-
     fn new(points: impl Iterator<Item = DVec2>) -> Self {
-        let inside = |p: DVec2| p.abs().max_element() < HALF_SIDE_M;
-        let column = |x: f64| ((x + HALF_SIDE_M) / CELL_M) as usize;
-        let cell = |p: DVec2| column(p.x) * Self::SIDE + column(p.y);
-        let mut placed: Vec<(usize, u32)> = points
-            .zip(0..)
-            .filter(|(p, _)| inside(*p))
-            .map(|(p, i)| (cell(p), i))
-            .collect();
+        let points: Vec<DVec2> = points.collect();
+        let Some((low, high)) = points.iter().fold(None, |bounds, &p| {
+            let (low, high) = bounds.unwrap_or((p, p));
+            Some((p.min(low), p.max(high)))
+        }) else {
+            return Self::default();
+        };
+        let of = |p: DVec2| ((p - low) / CELL_M).floor();
+        let sides = (of(high) + 1.0).to_array().map(|n| n as usize);
+        let cell = |p: DVec2| of(p).x as usize * sides[1] + of(p).y as usize;
+        let mut placed: Vec<(usize, u32)> = points.iter().map(|&p| cell(p)).zip(0..).collect();
         placed.sort_unstable();
-        let mut starts = vec![0; Self::SIDE * Self::SIDE + 1];
+        let mut starts = vec![0; sides[0] * sides[1] + 1];
         placed.iter().for_each(|(cell, _)| starts[cell + 1] += 1);
         for i in 1..starts.len() {
             starts[i] += starts[i - 1];
         }
         Self {
+            corner: low,
+            sides,
             starts,
             items: placed.into_iter().map(|(_, i)| i).collect(),
         }
     }
 
     fn near(&self, position: DVec2, radius: f64) -> impl Iterator<Item = u32> {
-        let span = |x: f64| {
-            let bound = |x: f64| {
-                ((x + HALF_SIDE_M) / CELL_M)
-                    .floor()
-                    .clamp(0.0, Self::SIDE as f64)
-            };
-            let (low, high) = (bound(x - radius) as usize, bound(x + radius) as usize + 1);
-            low.min(Self::SIDE)..high.min(Self::SIDE)
+        let span = |x: f64, corner: f64, side: usize| {
+            let cell = |x: f64| ((x - corner) / CELL_M).floor().clamp(-1.0, side as f64);
+            let (low, high) = (cell(x - radius), cell(x + radius) + 1.0);
+            low.max(0.0) as usize..(high as usize).min(side)
         };
-        let (xs, ys) = (span(position.x), span(position.y));
-        let runs = (!self.starts.is_empty()).then(|| {
-            xs.map(move |x| {
-                let at = |y: usize| self.starts[x * Self::SIDE + y] as usize;
-                &self.items[at(ys.start)..at(ys.end.max(ys.start))]
-            })
+        let xs = span(position.x, self.corner.x, self.sides[0]);
+        let ys = span(position.y, self.corner.y, self.sides[1]);
+        let runs = xs.map(move |x| {
+            let at = |y: usize| self.starts[x * self.sides[1] + y] as usize;
+            match ys.is_empty() {
+                true => &[][..],
+                false => &self.items[at(ys.start)..at(ys.end)],
+            }
         });
-        runs.into_iter().flatten().flatten().copied()
+        runs.flatten().copied()
     }
 }

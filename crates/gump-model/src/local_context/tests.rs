@@ -111,6 +111,28 @@ fn points_are_found_where_they_are() {
     // The edge passes two metres to the right.
     assert!((12..=15).contains(&near), "{near}");
     assert_eq!(lane_map.edges_near(dvec2(500.0, 0.0), 10.0).count(), 0);
+    assert_eq!(lane_map.edges_near(dvec2(-500.0, 900.0), 10.0).count(), 0);
+}
+
+#[test]
+fn edges_are_found_wherever_the_map_is() {
+    for far in [
+        dvec2(0.0, 0.0),
+        dvec2(300.0, -200.0),
+        dvec2(-8000.0, 6000.0),
+    ] {
+        let line =
+            [(-20.0, -2.0), (20.0, -2.0)].map(|(x, y)| format!(" {},{}", x + far.x, y + far.y));
+        let text = format!("edge:{}\nego vehicle 0: {},{}", line.concat(), far.x, far.y);
+        let map = gump_scene::fixture::scenario(&text).unwrap().map;
+        let edges = LaneMap::of_edges(&map, &[far], 50.0);
+        let found = edges
+            .edges_near(far, 10.0)
+            .filter(|edge| edge.from.distance(far) < 10.0);
+        // 19.6 m of them, in stretches of at most 1.5 m.
+        let found = found.count();
+        assert!((12..=15).contains(&found), "{found} at {far}");
+    }
 }
 
 #[test]

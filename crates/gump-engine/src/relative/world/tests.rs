@@ -129,3 +129,53 @@ fn one_of_two_that_hold_each_other_in_a_junction_backs_up() {
     }
     assert!(backed >= 4, "{backed}");
 }
+
+/// A vehicle that heads for the edge of its road, on a map around this place.
+fn towards_the_edge(place: DVec2) -> Scenario {
+    let at = |x: f64, y: f64| format!("{},{}", x + place.x, y + place.y);
+    let text = format!(
+        "lane 1: {} {} {} speed 13
+         edge: {} {}
+         ego vehicle 0: {} heading -0.08 velocity 11.96,-0.96 size 4.8,2",
+        at(-100.0, 0.0),
+        at(0.0, 0.0),
+        at(250.0, 0.0),
+        at(-100.0, -2.0),
+        at(250.0, -2.0),
+        at(0.0, -0.3),
+    );
+    fixture::scenario(&text).unwrap()
+}
+
+#[test]
+fn rules_keep_vehicles_on_the_road_wherever_the_map_is() {
+    let rules = RelativeSampling {
+        redraws: 12,
+        limits: true,
+        ..RelativeSampling::default()
+    };
+    let leave = |world: &RelativeWorld, place: DVec2| {
+        let scenario = towards_the_edge(place);
+        let leaves = |seed: &u64| {
+            let (future, _) = future(world, &scenario, *seed, 4);
+            let y = |point: DVec2| point.y - place.y;
+            let now = future.members[0].now();
+            let side = now.body.width / 2.0;
+            let corner = DVec2::new(now.body.length / 2.0, -side);
+            y(now.pose * corner).min(y(now.pose * DVec2::new(-corner.x, -side))) < -2.1
+        };
+        (0..32).filter(leaves).count()
+    };
+    let (alone, ruled) = (sampled(RelativeSampling::default()), sampled(rules));
+    for place in [
+        DVec2::ZERO,
+        DVec2::new(-300.0, 200.0),
+        DVec2::new(7000.0, -2000.0),
+    ] {
+        let (alone, ruled) = (leave(&alone, place), leave(&ruled, place));
+        assert!(
+            alone >= 4 && ruled == 0,
+            "{alone} alone, {ruled} ruled at {place}"
+        );
+    }
+}
