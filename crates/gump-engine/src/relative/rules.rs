@@ -36,6 +36,9 @@ const TURNS_AT_RED: f64 = 2.0;
 /// Braking for a light begins where this deceleration is sufficient, metres per second squared; it never
 /// exceeds [`HARDEST_MPS2`].
 const GENTLY: f64 = 4.0;
+/// Who can stop for a yellow light with this does, metres per second squared: the others pass before it is
+/// red.
+const FOR_YELLOW_MPS2: f64 = 3.0;
 
 /// The greatest acceleration in any direction that a dry road allows, metres per second squared. A draw
 /// of standing at 14 m/s is rare, but would stop a car within its own length.
@@ -157,9 +160,10 @@ impl StopLine {
         -local.x - now.body.length / 2.0 + OVER_M
     }
 
-    /// Whether an agent's front bumper crosses the line with this move, or cannot stop before it
-    /// afterwards. One that stands with its front over the line crosses it when it moves on.
-    fn is_crossed(&self, now: &Shown, step: Pose) -> bool {
+    /// Whether an agent's front bumper crosses the line with this move, or cannot stop before it afterwards
+    /// by braking so hard, metres per second squared. One that stands with its front over the line crosses
+    /// it when it moves on.
+    fn is_crossed(&self, now: &Shown, step: Pose, braking: f64) -> bool {
         let half = now.body.length / 2.0;
         let to = now.pose * step;
         // Within 60 degrees of the lane: others cross or leave it.
@@ -167,7 +171,7 @@ impl StopLine {
         let ahead = |pose: Pose| self.line.inverse() * (pose.position + pose.direction() * half);
         let (before, after) = (ahead(now.pose), ahead(to));
         let speed = step.position.length() / TOKEN_DT;
-        let reach = after.x + speed * speed / (2.0 * GENTLY);
+        let reach = after.x + speed * speed / (2.0 * braking);
         let stands = now.velocity().length() < CREEPING;
         let over = if stands { half } else { OVER_M };
         let stop = before.x.max(OVER_M);
@@ -176,17 +180,28 @@ impl StopLine {
 }
 
 /// The lines that an agent crosses with a move: the nearest ones, since those behind them belong to
-/// another junction.
+/// another junction, and of these that of its route, since those beside it are of other ways.
 fn crossed<'l>(
     now: &Shown,
     step: Pose,
     lines: &[(&'l StopLine, LightState)],
+    route: Option<&Route>,
 ) -> Vec<(&'l StopLine, LightState)> {
     let mut all: Vec<_> = lines.to_vec();
-    all.retain(|(line, _)| line.is_crossed(now, step));
+    all.retain(|(line, state)| {
+        let braking = match state {
+            LightState::Yellow => FOR_YELLOW_MPS2,
+            _ => GENTLY,
+        };
+        line.is_crossed(now, step, braking)
+    });
     let nearest = all.iter().map(|(line, _)| line.room(now));
     let nearest = nearest.fold(f64::INFINITY, f64::min);
     all.retain(|(line, _)| line.room(now) < nearest + ONE_LINE_M);
+    let is_meant = |line: &StopLine| route.is_some_and(|route| route.lanes().contains(&line.lane));
+    if all.iter().any(|(line, _)| is_meant(line)) {
+        all.retain(|(line, _)| is_meant(line));
+    }
     all
 }
 
@@ -202,15 +217,15 @@ fn slowed(now: &Shown, step: Pose, room: f64) -> Pose {
     Pose::IDENTITY.interpolate(step, (metres / length).min(1.0))
 }
 
-/// Whether an agent with this move runs a red light: every line that it crosses is red.
-fn runs_red(now: &Shown, step: Pose, lines: &[(&StopLine, LightState)]) -> bool {
-    let stopped = now.velocity().length() < TURNS_AT_RED;
-    let crossed = crossed(now, step, lines);
-    let mut shut = crossed
-        .iter()
-        .map(|(line, state)| *state == LightState::Red && !(line.is_right && stopped));
-    let first = shut.next();
-    first.is_some_and(|first| first && shut.all(|shut| shut))
+/// Whether no light lets an agent make this move, of those whose lines it crosses.
+fn runs_light(now: &Shown, crossed: &[(&StopLine, LightState)]) -> bool {
+    let speed = now.velocity().length();
+    let is_shut = |(line, state): &(&StopLine, LightState)| match state {
+        LightState::Red => !(line.is_right && speed < TURNS_AT_RED),
+        LightState::Yellow => speed * speed <= 2.0 * FOR_YELLOW_MPS2 * line.room(now),
+        _ => false,
+    };
+    !crossed.is_empty() && crossed.iter().all(is_shut)
 }
 
 /// What the rules of traffic forbid: lines that vehicles may not cross, and speeds at which they would
@@ -220,6 +235,8 @@ pub(super) struct Shut<'l> {
     lights: Vec<(&'l StopLine, LightState)>,
     /// Those before occupied junctions, by agent.
     entries: Vec<Option<StopLine>>,
+    /// Where agents mean to go.
+    routes: Vec<Option<&'l Route>>,
     /// The greatest speed for those that have the right of way, for stop signs and for bends, by agent,
     /// metres per second.
     most: Vec<f64>,
@@ -243,7 +260,7 @@ impl<'l> Shut<'l> {
     pub(super) fn of(
         map: &MapGraph,
         agents: &[Shown],
-        known: &[Known<'_>],
+        known: &[Known<'l>],
         lights: impl Iterator<Item = (&'l StopLine, LightState)>,
         colours: &Lights,
     ) -> Self {
@@ -277,6 +294,7 @@ impl<'l> Shut<'l> {
         Self {
             lights: lights.collect(),
             entries: (0..agents.len()).map(entry).collect(),
+            routes: known.iter().map(|known| known.route).collect(),
             most: (0..agents.len()).map(most).collect(),
         }
     }
@@ -286,8 +304,8 @@ impl<'l> Shut<'l> {
     pub(super) fn forbids(&self, agents: &[Shown], i: usize, step: Pose) -> bool {
         let now = &agents[i];
         let entry = self.entries[i].as_ref();
-        entry.is_some_and(|line| line.is_crossed(now, step))
-            || runs_red(now, step, &self.lights)
+        entry.is_some_and(|line| line.is_crossed(now, step, GENTLY))
+            || runs_light(now, &self.crossed(now, i, step))
             || step.position.length() / TOKEN_DT > self.at_most(now, i)
     }
 
@@ -297,12 +315,20 @@ impl<'l> Shut<'l> {
         self.most[i].max(now.velocity().length() - GENTLY * TOKEN_DT)
     }
 
-    /// The remaining distance to the first one that it crosses, metres.
+    /// The lines of lights that it crosses with this move.
+    fn crossed(&self, now: &Shown, i: usize, step: Pose) -> Vec<(&'l StopLine, LightState)> {
+        crossed(now, step, &self.lights, self.routes[i])
+    }
+
+    /// The remaining distance to the first shut one that it crosses, metres.
     fn room(&self, now: &Shown, i: usize, step: Pose) -> f64 {
-        let lights = crossed(now, step, &self.lights).into_iter();
+        let mut lights = self.crossed(now, i, step);
+        if !runs_light(now, &lights) {
+            lights.clear();
+        }
         let entry = self.entries[i].as_ref();
-        let entry = entry.filter(|line| line.is_crossed(now, step));
-        let lines = lights.map(|(line, _)| line).chain(entry);
+        let entry = entry.filter(|line| line.is_crossed(now, step, GENTLY));
+        let lines = lights.into_iter().map(|(line, _)| line).chain(entry);
         lines
             .map(|line| line.room(now))
             .fold(f64::INFINITY, f64::min)
@@ -471,7 +497,8 @@ fn braking(now: &Shown, step: Pose) -> Option<(Pose, Way)> {
 #[cfg(test)]
 mod tests {
     use gump_model::relative::graph::Body;
-    use gump_scene::fixture;
+    use gump_model::relative::route::Traveller;
+    use gump_scene::{Seed, fixture};
 
     use super::*;
 
@@ -591,6 +618,7 @@ mod tests {
         Shut {
             lights: lights.to_vec(),
             entries: vec![None],
+            routes: vec![None],
             most: vec![f64::INFINITY],
         }
     }
@@ -684,8 +712,12 @@ mod tests {
             4.0
         );
         // One way behind the line is open.
-        let open = [(&line, LightState::Red), (&line, LightState::Yellow)];
+        let open = [(&line, LightState::Red), (&line, LightState::Green)];
         assert_eq!(settled(car(0.0, 1.0), 4.0, &open, 1.0), 4.0);
+        // At yellow, 3.5 m before the line, one at 4 m/s stops, one at 6 would have to brake with 5 m/s².
+        let yellow = [(&line, LightState::Yellow)];
+        assert_eq!(settled(car(0.0, 2.0), 2.5, &yellow, 1.0), 1.0);
+        assert_eq!(settled(car(0.0, 3.0), 3.0, &yellow, 1.0), 3.0);
         // No other draw: it brakes, or stays where it stands.
         let braked = settled(car(0.0, 2.5), 4.0, &red, 4.0);
         assert!(braked < 2.6, "{braked}");
@@ -706,6 +738,40 @@ mod tests {
         assert_eq!(settled(car(4.5, 0.0), 4.0, &red, 1.0), 4.0);
         assert_eq!(settled(car(0.0, 0.5), 4.0, &red, 1.0), 4.0);
         assert_eq!(settled(car(0.0, 2.0), 4.0, &red, 1.0), 1.0);
+    }
+
+    #[test]
+    fn the_light_of_a_route_is_the_one_that_counts() {
+        // Straight on and to the right from one line, 5 m ahead.
+        let map = fixture::scenario(
+            "lane 1: -60,0 5,0 next 2,3\nlane 2: 5,0 60,0\nlane 3: 5,0 9,-1 11,-3 12,-7\n\
+             light 2 red: 5,0\nlight 3 red: 5,0\nego vehicle 0: -20,0",
+        )
+        .unwrap();
+        let lights: Vec<Light> = map.present().now().lights().to_vec();
+        let lines = StopLine::of(&map.map, &lights);
+        let shut: Vec<_> = lines.iter().map(|line| (line, LightState::Red)).collect();
+        let now = car(2.0, 0.5);
+        let goes = |way: i64| {
+            let who = |seed: u64| Traveller {
+                pose: now.pose,
+                speed: 1.0,
+                seed: Seed(seed),
+            };
+            let routes = (0..64).filter_map(|seed| Route::from_here(&map.map, who(seed)));
+            let route = routes
+                .into_iter()
+                .find(|route| route.lanes().contains(&LaneId(way)))
+                .unwrap();
+            let shut = Shut {
+                routes: vec![Some(&route)],
+                ..lit(&shut)
+            };
+            shut.forbids(&[now], 0, straight(2.0))
+        };
+        // To the right after a stop; one without a route may mean to.
+        assert_eq!([goes(2), goes(3)], [true, false]);
+        assert!(!lit(&shut).forbids(&[now], 0, straight(2.0)));
     }
 
     #[test]

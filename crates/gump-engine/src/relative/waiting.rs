@@ -21,6 +21,7 @@
 //! * Bicycles, and agents that were seen to drive, count as in a lane farther from its centre.
 
 use gump_geometry::{DVec2, angle_difference};
+use gump_model::relative::route::Route;
 use gump_scene::{Agent, AgentKind, Lane, LaneAhead, Light, LightState, MapGraph, lanes_ahead};
 
 // Chosen by hand when the rule was made (decision 26). Result 23 varies how long an agent has stood
@@ -81,7 +82,7 @@ const CROSSES: f64 = 0.52;
 
 /// An agent of a frame, and what is known of its past.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Standing {
+pub(super) struct Standing<'r> {
     pub(super) agent: Agent,
     /// Time that it has stood, seconds; 0 if it moves.
     pub(super) waited_s: f64,
@@ -89,6 +90,8 @@ pub(super) struct Standing {
     pub(super) patience_s: f64,
     /// Whether it was seen to drive: it is not parked, wherever it stands.
     pub(super) has_driven: bool,
+    /// Where it means to go; other ways ahead do not count then.
+    pub(super) route: Option<&'r Route>,
 }
 
 /// The room that others must leave.
@@ -122,10 +125,10 @@ pub(super) struct Released {
 pub(super) fn released(
     map: &MapGraph,
     lights: &[Light],
-    agents: &[Standing],
+    agents: &[Standing<'_>],
     is_late: bool,
 ) -> Released {
-    let inside = |one: &Standing| match one.waited_s {
+    let inside = |one: &Standing<'_>| match one.waited_s {
         _ if one.patience_s.is_infinite() => false,
         waited if waited > INSIDE_S => is_inside(map, one),
         waited => is_late && waited > CLEARS_S && has_to_clear(map, lights, one),
@@ -189,7 +192,7 @@ pub(super) fn released(
 }
 
 /// Whether an agent has waited less than another; of those that have waited as long the last one has.
-fn came_later(one: &Standing, other: &Standing) -> bool {
+fn came_later(one: &Standing<'_>, other: &Standing<'_>) -> bool {
     (-one.waited_s, one.agent.id) > (-other.waited_s, other.agent.id)
 }
 
@@ -202,14 +205,14 @@ fn stands_across(agent: &Agent, other: &Agent) -> bool {
 
 /// Those that back up, of the agents that are held in a junction by others that stand across their path:
 /// the vehicle that came last of those that have room behind and stand in the way of another themselves.
-fn backing(map: &MapGraph, agents: &[Standing], stuck: &[usize]) -> Vec<(usize, Vec<usize>)> {
+fn backing(map: &MapGraph, agents: &[Standing<'_>], stuck: &[usize]) -> Vec<(usize, Vec<usize>)> {
     let apart = |one: &Agent, other: &Agent| {
         let (from, to) = (one.state.pose.position, other.state.pose.position);
         from.distance(to)
     };
     let blocked = |i: usize| -> Vec<usize> {
         let agent = &agents[i].agent;
-        let is_blocked = |other: &Standing| {
+        let is_blocked = |other: &Standing<'_>| {
             let reached = ahead(map, other);
             !reached.is_empty() && holds(&reached, &other.agent, agent, true, &USUAL)
         };
@@ -257,7 +260,7 @@ pub(super) fn has_room_behind<'a>(agent: &Agent, mut all: impl Iterator<Item = &
 }
 
 /// Whether an agent is on a lane of a junction, or was driving and is between its lanes.
-fn is_inside(map: &MapGraph, one: &Standing) -> bool {
+fn is_inside(map: &MapGraph, one: &Standing<'_>) -> bool {
     let beside = if one.has_driven {
         ASTRAY_INSIDE_M
     } else {
@@ -268,7 +271,7 @@ fn is_inside(map: &MapGraph, one: &Standing) -> bool {
 }
 
 /// Whether an agent was driving and is on a lane of a junction whose light has ended its green.
-fn has_to_clear(map: &MapGraph, lights: &[Light], one: &Standing) -> bool {
+fn has_to_clear(map: &MapGraph, lights: &[Light], one: &Standing<'_>) -> bool {
     if !one.has_driven || lights.is_empty() {
         return false;
     }
@@ -301,9 +304,9 @@ fn meet(own: &[LaneAhead<'_>], its: &[LaneAhead<'_>]) -> bool {
     })
 }
 
-/// The lane that a vehicle or bicycle stands in and those that follow within [`LOOK_M`]; empty for
-/// agents beside the lanes. Distances are from its front bumper.
-fn ahead<'m>(map: &'m MapGraph, standing: &Standing) -> Vec<LaneAhead<'m>> {
+/// The lane that a vehicle or bicycle stands in and those that follow within [`LOOK_M`], of its route if it
+/// is on one; empty for agents beside the lanes. Distances are from its front bumper.
+fn ahead<'m>(map: &'m MapGraph, standing: &Standing<'_>) -> Vec<LaneAhead<'m>> {
     let agent = &standing.agent;
     let (beside, turned) = match (agent.kind, standing.has_driven) {
         (AgentKind::Vehicle | AgentKind::Bicycle, true) => (ASTRAY_INSIDE_M, TURNED),
@@ -318,11 +321,23 @@ fn ahead<'m>(map: &'m MapGraph, standing: &Standing) -> Vec<LaneAhead<'m>> {
         (angle_difference(heading, pose.heading).abs() < turned).then_some(at)
     };
     let near = map.lanes_near(pose.position, beside);
-    let mut near = near.filter(|(lane, metres)| *metres <= ASTRAY_M || lane.in_intersection);
-    let Some((lane, at)) = near.find_map(|(lane, _)| Some((lane, along(lane)?))) else {
+    let near = near.filter(|(lane, metres)| *metres <= ASTRAY_M || lane.in_intersection);
+    let on: Vec<_> = near
+        .filter_map(|(lane, _)| Some((lane, along(lane)?)))
+        .collect();
+    let is_meant = |lane: &Lane| {
+        let route = standing.route;
+        route.is_some_and(|route| route.lanes().contains(&lane.id))
+    };
+    let meant = on.iter().find(|(lane, _)| is_meant(lane));
+    let Some(&(lane, at)) = meant.or(on.first()) else {
         return Vec::new();
     };
-    lanes_ahead(map, lane, at + agent.length / 2.0, LOOK_M).0
+    let mut reached = lanes_ahead(map, lane, at + agent.length / 2.0, LOOK_M).0;
+    if meant.is_some() {
+        reached.retain(|part| is_meant(part.lane));
+    }
+    reached
 }
 
 /// Whether the lights ahead forbid every way on.
@@ -425,6 +440,7 @@ mod tests {
                 waited_s: since(agent.id).map_or(0.0, |(_, s)| *s),
                 patience_s: 4.0,
                 has_driven,
+                route: None,
             })
             .collect();
         let found = released(scene.map, scene.now().lights(), &agents, false);
@@ -551,6 +567,7 @@ mod tests {
                 waited_s,
                 patience_s,
                 has_driven: true,
+                route: None,
             };
             let agents: Vec<_> = scene.now().agents().iter().map(standing).collect();
             released(&MapGraph::new(parts).unwrap(), &[], &agents, false).go
@@ -579,6 +596,7 @@ mod tests {
                 waited_s: if agent.id.0 == 0 { waited_s } else { 0.0 },
                 patience_s: 20.0,
                 has_driven: true,
+                route: None,
             };
             let scene = scenario.present();
             let agents: Vec<_> = scene.now().agents().iter().map(standing).collect();
@@ -621,6 +639,7 @@ mod tests {
                 waited_s: *waited.get(agent.id.0 as usize).unwrap_or(&0.0),
                 patience_s: 20.0,
                 has_driven: true,
+                route: None,
             };
             let scene = scenario.present();
             let agents: Vec<_> = scene.now().agents().iter().map(standing).collect();

@@ -303,9 +303,8 @@ pub(super) struct Scene {
     centres: Vec<DVec2>,
     map: VectorMap,
     pub memory: MapMemory,
-    /// The edges of the road and the lines before lights, where rules look at them.
+    /// The edges of the road, where rules look at them.
     pub lane_map: LaneMap,
-    lines: Vec<StopLine>,
     ego: AgentId,
     /// The lights that it may show.
     lights: Vec<Light>,
@@ -339,10 +338,6 @@ impl Scene {
             lane_map: match sampling.redraws {
                 0 => LaneMap::default(),
                 _ => LaneMap::of_curbs(&source, &centres, MAP_M),
-            },
-            lines: match sampling.redraws {
-                0 => Vec::new(),
-                _ => StopLine::of(&source, lights),
             },
             source,
             centres,
@@ -392,6 +387,8 @@ struct Future {
     lights: Vec<Light>,
     /// The input of the network for them.
     shown_lights: Lights,
+    /// The lines before all lights that it has shown or may show, where rules look at them.
+    lines: Arc<Vec<StopLine>>,
     /// Lights of the present frame.
     lights_now: Vec<Light>,
     /// Hidden vectors of the present's nodes, `[members, C]`.
@@ -428,6 +425,10 @@ impl Future {
             lights: state.now().lights().to_vec(),
             lights_now: state.now().lights().to_vec(),
             shown_lights: Lights::default(),
+            lines: match scene.has_rules {
+                true => Arc::new(StopLine::of(&scene.source, &scene.lights)),
+                false => Arc::default(),
+            },
             hidden: Vec::new(),
         };
         let now = state.history.len() - 1;
@@ -650,12 +651,14 @@ impl Future {
                     false => self.patience_s(member),
                 },
                 has_driven: member.has_driven,
+                route: member.intent.route(),
             });
             let others = self.others.iter().map(|&agent| Standing {
                 agent,
                 waited_s: 0.0,
                 patience_s: f64::INFINITY,
                 has_driven: false,
+                route: None,
             });
             let all: Vec<_> = members.chain(others).collect();
             let released = released(map, &self.lights, &all, is_late);
@@ -728,7 +731,7 @@ impl Future {
         let could_go = |i: &usize| self.members[*i].could_go && driven != Some(*i);
         let standing = (0..agents.len()).filter(could_go).collect();
         start(standing, &mut moves, &mut again);
-        let lines = self.scene.lines.iter().filter_map(|line| {
+        let lines = self.lines.iter().filter_map(|line| {
             let lights = &self.lights_now;
             let i = lights.binary_search_by_key(&line.lane, |light| light.lane);
             Some((line, lights[i.ok()?].state))
@@ -829,6 +832,7 @@ impl Future {
         self.lights = lights.to_vec();
         // Looked up by lane.
         self.lights.sort_by_key(|light| light.lane);
+        self.draw_lines();
         let before = std::mem::take(&mut self.shown_lights.by_lane);
         let shown = lights.iter().map(|light| {
             let known = before.iter().find(|(lane, ..)| *lane == light.lane);
@@ -845,6 +849,26 @@ impl Future {
         // Looked up by lane.
         shown.sort_by_key(|(lane, ..)| *lane);
         self.shown_lights.by_lane = shown;
+    }
+
+    /// Adds the lines before lights that are shown for the first time: those that signals complete, or that
+    /// come into sight.
+    fn draw_lines(&mut self) {
+        if !self.scene.has_rules {
+            return;
+        }
+        let is_new = |light: &&Light| self.lines.iter().all(|line| line.lane != light.lane);
+        let new: Vec<Light> = self.lights.iter().filter(is_new).copied().collect();
+        let new = StopLine::of(&self.scene.source, &new);
+        if !new.is_empty() {
+            self.lines = self
+                .lines
+                .iter()
+                .cloned()
+                .chain(new)
+                .collect::<Vec<_>>()
+                .into();
+        }
     }
 
     /// Lets agents go and others come, whom the network sees for the first time where they are now.

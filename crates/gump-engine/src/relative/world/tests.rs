@@ -179,3 +179,42 @@ fn rules_keep_vehicles_on_the_road_wherever_the_map_is() {
         );
     }
 }
+
+#[test]
+fn lights_that_are_shown_later_stop_vehicles_too() {
+    let rules = RelativeSampling {
+        redraws: 12,
+        limits: true,
+        ..RelativeSampling::default()
+    };
+    let (world, scenario) = (sampled(rules), fork());
+    let lit = fixture::scenario(
+        "lane 2: 0,0 30,0\nlane 3: 0,0 30,1\nlight 2 red: 0,0\nlight 3 red: 0,0
+         ego vehicle 0: -32,0",
+    )
+    .unwrap();
+    let lights = lit.present().now().lights().to_vec();
+    let front = |seed: u64, lights: &[Light]| {
+        let start = Start {
+            scene: scenario.present(),
+            n_futures: 1,
+            seed: Seed(seed),
+        };
+        let mut future = world.begin(&[start]).unwrap().remove(0);
+        let mut room = Workspace::default();
+        for _ in 0..16 {
+            future.show(lights);
+            let all = std::slice::from_mut(&mut future);
+            Future::step_all(all, &world.engine, &world.sampling, None, &mut room);
+        }
+        let now = future.members[0].now();
+        now.pose.position.x + now.body.length / 2.0
+    };
+    for seed in 0..8 {
+        let (red, none) = (front(seed, &lights), front(seed, &[]));
+        assert!(
+            red < 0.6 && none > 1.0,
+            "{red} before red lights, {none} without"
+        );
+    }
+}
