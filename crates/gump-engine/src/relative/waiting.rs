@@ -24,6 +24,8 @@ use gump_geometry::{DVec2, angle_difference};
 use gump_model::relative::route::Route;
 use gump_scene::{Agent, AgentKind, Lane, LaneAhead, Light, LightState, MapGraph, lanes_ahead};
 
+use crate::relative::approach::has_sign;
+
 // Chosen by hand when the rule was made (decision 26). Result 23 varies how long an agent has stood
 // and how often it is redrawn, but none of these.
 
@@ -75,6 +77,8 @@ const STUCK_S: f64 = 12.0;
 /// ... if there is so much room behind it, and so much beside that, metres.
 const BEHIND_M: f64 = 3.0;
 const BESIDE_IT_M: f64 = 0.3;
+/// A vehicle no faster than this may come to a stop within a step, metres per second.
+const ROLLS_MPS: f64 = 4.0;
 /// Agents that wait for each other are within this, metres, and meet at more than this angle,
 /// radians.
 const MEETING_M: f64 = 25.0;
@@ -109,6 +113,8 @@ struct Room {
 pub(super) struct Released {
     /// They could go on.
     pub(super) go: Vec<usize>,
+    /// Vehicles that roll slowly, and have nothing to stop for.
+    pub(super) roll: Vec<usize>,
     /// They stand in the way of others in a junction, as these in theirs, and have room to back up; with
     /// each these others.
     pub(super) back_up: Vec<(usize, Vec<usize>)>,
@@ -121,7 +127,8 @@ pub(super) struct Released {
 /// in a junction at once, less room suffices between vehicles that stand across each other's paths.
 /// In a junction, where even that is missing for [`STUCK_S`], the vehicle that came last backs up.
 /// A pedestrian could if it stands on the path of a vehicle or bicycle that has waited as long.
-/// `agents` are all of the frame. If it `is_late`, those clear a junction whose light has changed.
+/// `agents` are all of the frame. If it `is_late`, those clear a junction whose light has changed, and
+/// vehicles that roll without a reason to stop are returned as well.
 pub(super) fn released(
     map: &MapGraph,
     lights: &[Light],
@@ -171,6 +178,23 @@ pub(super) fn released(
             stuck.push(i);
         }
     }
+    let rolls = |i: &usize| {
+        let agent = &agents[*i].agent;
+        let speed = agent.state.speed();
+        let is_slow = speed > MOVES && speed < ROLLS_MPS;
+        if !is_late || !is_slow || agent.kind != AgentKind::Vehicle {
+            return false;
+        }
+        let reached = ahead(map, &agents[*i]);
+        let is_held = || {
+            let others = agents.iter().enumerate().filter(|(j, _)| j != i);
+            let mut others = others.map(|(j, other)| (waits(&j), &other.agent));
+            others.any(|(stays, other)| holds(&reached, agent, other, stays, &USUAL))
+        };
+        let is_signed = || reached.iter().any(|part| has_sign(map, part.lane));
+        !reached.is_empty() && !is_shut(&reached, lights) && !is_signed() && !is_held()
+    };
+    let roll = (0..agents.len()).filter(rolls).collect();
     let goes_first = |(i, own): &(usize, Vec<LaneAhead<'_>>), (j, its): &(usize, Vec<_>)| {
         let (one, other) = (&agents[*i], &agents[*j]);
         let (from, of) = (one.agent.state.pose, other.agent.state.pose);
@@ -187,6 +211,7 @@ pub(super) fn released(
     next.dedup();
     Released {
         go: next,
+        roll,
         back_up: backing(map, agents, &stuck),
     }
 }
@@ -421,7 +446,8 @@ fn holds(
 mod tests {
     use std::sync::Arc;
 
-    use gump_scene::{AgentId, Scenario, fixture};
+    use gump_model::relative::route::Traveller;
+    use gump_scene::{AgentId, LaneId, Scenario, Seed, fixture};
 
     use super::*;
 
@@ -482,6 +508,73 @@ mod tests {
         // It has passed, or does not move.
         assert_eq!(free(&crossing(20.0, 8.0), &waited), [0]);
         assert_eq!(free(&crossing(-20.0, 0.0), &waited), [0]);
+    }
+
+    #[test]
+    fn who_rolls_has_a_reason_to_stop_or_is_told_apart() {
+        let lanes = "lane 1: 0,0 30,0 next 2,3\nlane 2: 30,0 60,0\nlane 3: 30,0 60,20\n";
+        let rolling = |speed: f64, rest: &str| {
+            let scenario = scenario(&format!(
+                "{lanes}ego vehicle 0: 20,0 velocity {speed},0\n{rest}"
+            ));
+            let scene = scenario.present();
+            let agents = scene.now().agents().iter();
+            let agents: Vec<_> = agents
+                .map(|agent| Standing {
+                    agent: *agent,
+                    waited_s: 0.0,
+                    patience_s: 4.0,
+                    has_driven: true,
+                    route: None,
+                })
+                .collect();
+            let rolls = |is_late: bool| {
+                let found = released(scene.map, scene.now().lights(), &agents, is_late);
+                found.roll.contains(&0)
+            };
+            assert!(!rolls(false));
+            rolls(true)
+        };
+        assert!(rolling(2.0, ""));
+        assert!(!rolling(0.0, "") && !rolling(8.0, ""));
+        assert!(!rolling(2.0, "agent vehicle 1: 27,0"));
+        assert!(rolling(2.0, "agent vehicle 1: 37,0"));
+        assert!(!rolling(2.0, "light 1 red: 30,0"));
+        assert!(!rolling(2.0, "light 1 yellow: 30,0"));
+        // One way is open, and it means to take any.
+        assert!(rolling(2.0, "light 2 red: 30,0\nlight 3 green: 30,0"));
+    }
+
+    #[test]
+    fn routes_tell_which_light_holds() {
+        let scenario = scenario(
+            "lane 1: 0,0 30,0 next 2,3\nlane 2: 30,0 90,0\nlane 3: 30,0 40,20
+             light 2 red: 30,0\nlight 3 green: 30,0\nego vehicle 0: 26,0",
+        );
+        let scene = scenario.present();
+        let goes = |way: i64| {
+            let who = |seed: u64| Traveller {
+                pose: scene.ego_now().state.pose,
+                speed: 0.0,
+                seed: Seed(seed),
+            };
+            let routes = (0..64).filter_map(|seed| Route::from_here(scene.map, who(seed)));
+            let route = routes
+                .into_iter()
+                .find(|route| route.lanes().contains(&LaneId(way)))
+                .unwrap();
+            let ego = Standing {
+                agent: *scene.ego_now(),
+                waited_s: 9.0,
+                patience_s: 4.0,
+                has_driven: true,
+                route: Some(&route),
+            };
+            !released(scene.map, scene.now().lights(), &[ego], true)
+                .go
+                .is_empty()
+        };
+        assert_eq!([goes(2), goes(3)], [false, true]);
     }
 
     #[test]

@@ -360,7 +360,7 @@ struct Member {
     idle: f64,
     /// Whether it was faster than [`DRIVES`] in a frame since.
     has_driven: bool,
-    /// Whether it stands in a lane although nothing holds it.
+    /// Whether it stands in a lane, or rolls slowly, although nothing holds it.
     could_go: bool,
     /// Steps for which it backs up for others, and waits afterwards.
     backing: usize,
@@ -638,7 +638,7 @@ impl Future {
             member.could_go = false;
             member.backing = member.backing.saturating_sub(1);
             member.let_pass = member.let_pass.saturating_sub(1);
-            is_one_waiting |= member.idle_s() > shortest;
+            is_one_waiting |= is_late || member.idle_s() > shortest;
             let is_long = member.waited > WAITED_S && stands_in_lane(map, &member.agent);
             limits.push(is_long.then_some(WAITED_S));
         }
@@ -670,6 +670,9 @@ impl Future {
                         member.let_pass = BACKS_UP + WAITS_BACK;
                     }
                 }
+            }
+            for i in released.roll {
+                self.members[i].could_go = true;
             }
             for i in released.go {
                 let member = &mut self.members[i];
