@@ -77,6 +77,9 @@ const STUCK_S: f64 = 12.0;
 /// ... if there is so much room behind it, and so much beside that, metres.
 const BEHIND_M: f64 = 3.0;
 const BESIDE_IT_M: f64 = 0.3;
+/// After a benchmark's time people who have stood this long before a vehicle that has stood as long walk
+/// on, seconds.
+const BEFORE_VEHICLE_S: f64 = 2.0;
 /// A vehicle no faster than this may come to a stop within a step, metres per second.
 const ROLLS_MPS: f64 = 4.0;
 /// Agents that wait for each other are within this, metres, and meet at more than this angle,
@@ -127,8 +130,8 @@ pub(super) struct Released {
 /// in a junction at once, less room suffices between vehicles that stand across each other's paths.
 /// In a junction, where even that is missing for [`STUCK_S`], the vehicle that came last backs up.
 /// A pedestrian could if it stands on the path of a vehicle or bicycle that has waited as long.
-/// `agents` are all of the frame. If it `is_late`, those clear a junction whose light has changed, and
-/// vehicles that roll without a reason to stop are returned as well.
+/// `agents` are all of the frame. If it `is_late`, those clear a junction whose light has changed, people
+/// walk on before vehicles sooner, and vehicles that roll without a reason to stop are returned as well.
 pub(super) fn released(
     map: &MapGraph,
     lights: &[Light],
@@ -178,6 +181,9 @@ pub(super) fn released(
             stuck.push(i);
         }
     }
+    if is_late {
+        people.extend(in_the_way(map, agents));
+    }
     let rolls = |i: &usize| {
         let agent = &agents[*i].agent;
         let speed = agent.state.speed();
@@ -214,6 +220,29 @@ pub(super) fn released(
         roll,
         back_up: backing(map, agents, &stuck),
     }
+}
+
+/// People who stand on the path of a vehicle, both for [`BEFORE_VEHICLE_S`].
+fn in_the_way(map: &MapGraph, agents: &[Standing<'_>]) -> Vec<usize> {
+    let stand = |kind: AgentKind| {
+        let all = agents.iter().enumerate();
+        all.filter(move |(_, one)| one.agent.kind == kind && one.waited_s > BEFORE_VEHICLE_S)
+    };
+    let mut found = Vec::new();
+    for (j, person) in stand(AgentKind::Pedestrian) {
+        let at = person.agent.state.pose.position;
+        let holds_one = |one: &Standing<'_>| {
+            let reach = one.agent.length + USUAL.ahead_m + SIDE_OF_PEOPLE_M;
+            one.agent.state.pose.position.distance(at) < reach && {
+                let reached = ahead(map, one);
+                !reached.is_empty() && holds(&reached, &one.agent, &person.agent, true, &USUAL)
+            }
+        };
+        if stand(AgentKind::Vehicle).any(|(_, one)| holds_one(one)) {
+            found.push(j);
+        }
+    }
+    found
 }
 
 /// Whether an agent has waited less than another; of those that have waited as long the last one has.
@@ -543,6 +572,30 @@ mod tests {
         assert!(!rolling(2.0, "light 1 yellow: 30,0"));
         // One way is open, and it means to take any.
         assert!(rolling(2.0, "light 2 red: 30,0\nlight 3 green: 30,0"));
+    }
+
+    #[test]
+    fn people_walk_on_before_a_vehicle_that_waits_for_them() {
+        let scenario = scenario(
+            "lane 1: 0,0 90,0\nego vehicle 0: 20,0\nagent pedestrian 1: 25,0.5\nagent pedestrian 2: 25,4",
+        );
+        let scene = scenario.present();
+        let gone = |is_late: bool, waited: [f64; 2]| {
+            let agents = scene.now().agents().iter();
+            let agents: Vec<_> = agents
+                .map(|agent| Standing {
+                    agent: *agent,
+                    waited_s: waited[usize::from(agent.id.0 > 0)],
+                    patience_s: 9.0,
+                    has_driven: true,
+                    route: None,
+                })
+                .collect();
+            released(scene.map, scene.now().lights(), &agents, is_late).go
+        };
+        assert_eq!(gone(true, [3.0, 3.0]), [1]);
+        assert!(gone(false, [3.0, 3.0]).is_empty());
+        assert!(gone(true, [1.0, 3.0]).is_empty() && gone(true, [3.0, 1.0]).is_empty());
     }
 
     #[test]
