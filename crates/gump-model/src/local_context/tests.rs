@@ -124,7 +124,7 @@ fn edges_are_found_wherever_the_map_is() {
         let line =
             [(-20.0, -2.0), (20.0, -2.0)].map(|(x, y)| format!(" {},{}", x + far.x, y + far.y));
         let text = format!("edge:{}\nego vehicle 0: {},{}", line.concat(), far.x, far.y);
-        let map = gump_scene::fixture::scenario(&text).unwrap().map;
+        let map = fixture::scenario(&text).unwrap().map;
         let edges = LaneMap::of_edges(&map, &[far], 50.0);
         let found = edges
             .edges_near(far, 10.0)
