@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use gump_eval::worlds::WorldName;
 use gump_scene::{Rollout, Scenario, SceneState};
 use gump_viz::{Film, FilmSpec, LabelledRollout, can_encode_mp4, grid_film, log_as_rollout};
 use serde::Serialize;
@@ -190,6 +191,22 @@ fn log_until(scenario: &Scenario, futures: &[(&str, &Rollout)]) -> Rollout {
         cut.push(frame.clone());
     }
     cut
+}
+
+/// The label of a drive: who drives, and in which world's traffic.
+pub(crate) fn label(driver: &str, world: &WorldName) -> String {
+    match world {
+        WorldName::Model(_) => format!("{driver} among learned traffic"),
+        other => format!("{driver} among {other}"),
+    }
+}
+
+/// A world's name as part of that of a film's file.
+pub(crate) fn short(world: &WorldName) -> String {
+    match world {
+        WorldName::Model(_) => "model".into(),
+        other => other.to_string(),
+    }
 }
 
 /// The first few futures with their numbers, for a film.

@@ -3,7 +3,8 @@
 use std::sync::Arc;
 
 use gump_metrics::{Interval, intervals_of_groups};
-use gump_scene::Seed;
+use gump_rollout::{SimulateConfig, fill};
+use gump_scene::{Rollout, Seed};
 use rand::Rng as _;
 
 use crate::{
@@ -141,6 +142,14 @@ impl Episodes {
             seed,
         }
     }
+
+    /// The start of a drive of one of them.
+    fn start(&self, scenario: usize, repeat: usize) -> EpisodeStart {
+        EpisodeStart {
+            scenario,
+            seed: self.seed.fork(scenario as u64).fork(repeat as u64),
+        }
+    }
 }
 
 /// Drives these episodes, `config.n_envs` in parallel.
@@ -172,12 +181,9 @@ pub fn evaluate(
             ..*config
         };
         let mut env = DrivingEnv::new(Arc::clone(prepared), traffic, config)?;
-        let start = |&(scenario, repeat): &(usize, usize)| EpisodeStart {
-            scenario,
-            seed: episodes.seed.fork(scenario as u64).fork(repeat as u64),
-        };
+        let start = |&(scenario, repeat): &(usize, usize)| episodes.start(scenario, repeat);
         let starts: Vec<EpisodeStart> = episodes_now.iter().map(start).collect();
-        let outcomes = drive(&mut env, driver, &starts)?;
+        let outcomes = drive(&mut env, driver, &starts, &mut |_| Ok(()))?;
         let ended = episodes_now.iter().zip(&outcomes);
         drives
             .extend(ended.map(|(&(scenario, repeat), o)| EpisodeResult::new(scenario, repeat, o)));
@@ -185,13 +191,75 @@ pub fn evaluate(
     Ok(drives)
 }
 
-/// Drives every row to the end of its first episode.
+/// The first drive of a scenario among those of an evaluation, with all agents, at the time step of the
+/// scenario: to be looked at.
+///
+/// `scenario` is an index of `prepared`, `seed` that of [`Episodes`]. The ego drives as in [`evaluate`]; the
+/// rollout ends where its episode does.
+///
+/// # Errors
+/// As [`evaluate`].
+pub fn recorded_drive(
+    prepared: &Arc<[PreparedScenario]>,
+    traffic: TrafficSource<'_>,
+    config: &EnvConfig,
+    driver: EvaluatedPolicy<'_>,
+    (scenario, seed): (usize, Seed),
+) -> Result<Rollout, RlError> {
+    let config = EnvConfig {
+        n_envs: 1,
+        // The last frame of the episode is there until the next begins.
+        autoreset: Autoreset::Disabled,
+        nearest: None,
+        ..*config
+    };
+    let episodes = Episodes {
+        scenarios: vec![scenario],
+        repeats: 1,
+        seed,
+    };
+    let mut env = DrivingEnv::new(Arc::clone(prepared), traffic, config)?;
+    let mut rollout = None;
+    let mut record = |env: &DrivingEnv<'_>| {
+        let (Some(frame), Some(prepared)) = (env.frame(0), prepared.get(scenario)) else {
+            return Ok(());
+        };
+        let Some(rollout) = &mut rollout else {
+            rollout = Some(Rollout::begin(prepared.scenario().present()));
+            return Ok(());
+        };
+        let frames = fill(
+            rollout.last(),
+            &frame,
+            prepared.dt(),
+            &SimulateConfig::default(),
+        );
+        let frames = frames.map_err(|_| RlError::TimeStep {
+            step: prepared.dt(),
+            frames: rollout.dt(),
+        })?;
+        frames.into_iter().for_each(|frame| rollout.push(frame));
+        Ok(())
+    };
+    drive(
+        &mut env,
+        driver,
+        &[episodes.start(scenario, 0)],
+        &mut record,
+    )?;
+    rollout.ok_or(RlError::NotReset)
+}
+
+/// Drives every row to the end of its first episode; `visit` sees the environment at the start and after
+/// every step.
 fn drive(
     env: &mut DrivingEnv<'_>,
     driver: EvaluatedPolicy<'_>,
     starts: &[EpisodeStart],
+    visit: &mut dyn FnMut(&DrivingEnv<'_>) -> Result<(), RlError>,
 ) -> Result<Vec<Outcome>, RlError> {
     env.reset_to(starts)?;
+    visit(env)?;
     let (n, o, a) = (env.n_envs(), env.observation_len(), env.action_len());
     // Seeds that no world forks from the start of an episode.
     let of_driver = |start: &EpisodeStart| start.seed.fork(u64::MAX).rng();
@@ -217,6 +285,7 @@ fn drive(
             }
         }
         env.step(&actions)?;
+        visit(env)?;
         for (row, outcome) in env.finished() {
             outcomes[*row].get_or_insert(*outcome);
         }

@@ -55,7 +55,7 @@ pub use episode::{End, EpisodeState, Failure, RewardWeights, Rules, Totals};
 pub use error::RlError;
 pub use evaluate::{
     Columns, EpisodeResult, Episodes, Estimate, EvaluatedPolicy, LOGGED_PROGRESS, estimate,
-    estimate_difference, evaluate, score_by_scenario,
+    estimate_difference, evaluate, recorded_drive, score_by_scenario,
 };
 pub use imitation::demonstrations;
 pub use observation::{

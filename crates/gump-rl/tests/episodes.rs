@@ -7,8 +7,9 @@ mod common;
 use common::{DT, STREET, busy, config, env, street, until_end, wander};
 use gump_metrics::{Collision, Metric, OffRoad, Reward};
 use gump_rl::{
-    BicycleLimits, DrivingEnv, Dynamics, End, EnvConfig, EpisodeState, Failure, PoseLimits,
-    PreparedScenario, RlError, Rules, TrafficSource, VectorEnv,
+    BicycleLimits, DrivingEnv, Dynamics, End, EnvConfig, EpisodeState, Episodes, EvaluatedPolicy,
+    Failure, PoseLimits, PreparedScenario, RlError, Rules, TrafficSource, VectorEnv, evaluate,
+    recorded_drive,
 };
 use gump_rollout::worlds::{ConstantVelocity, Idm};
 use gump_scene::{AgentState, Frame, Rollout, SceneState, Seed, fixture};
@@ -38,6 +39,30 @@ fn a_free_road_is_driven_to_the_horizon() {
         assert!(env.finished().is_empty() && !env.restarted()[0]);
         assert_eq!(env.episode(0).unwrap().1.steps, 1);
         assert_eq!(env.observations(), env.final_observations());
+    }
+}
+
+#[test]
+fn a_recorded_drive_is_that_of_the_evaluation() {
+    let prepared = street("agent vehicle 1: 34.85,0");
+    let coast = EvaluatedPolicy::Constant(&COAST);
+    let (idm, seed) = (Idm::default(), Seed(3));
+    for traffic in [TrafficSource::Log, TrafficSource::World(&idm)] {
+        let episodes = Episodes::all(prepared.len(), 1, seed);
+        let result = evaluate(&prepared, traffic, &config(4), coast, &episodes).unwrap()[0];
+        let drive = recorded_drive(&prepared, traffic, &config(4), coast, (0, seed)).unwrap();
+        // Five frames of the scenario's in a step.
+        assert_eq!(drive.steps(), 5 * result.steps);
+        assert_eq!(drive.dt(), prepared[0].scenario().dt);
+        let x = |k: usize| drive.at(k).ego_now().state.pose.position.x;
+        for k in 1..=drive.steps() {
+            assert!((x(k) - x(k - 1) - 1.0).abs() < 1e-6, "{k}");
+            assert_eq!(drive.at(k).now().agents().len(), 2);
+        }
+        assert!((x(drive.steps()) - x(0) - result.progress).abs() < 1e-6);
+        let touches = |k: usize| Collision.at(&drive.at(k), drive.at(k).ego_now()) == Some(1.0);
+        let n = (0..=drive.steps()).filter(|&k| touches(k)).count();
+        assert_eq!(n > 0, result.collided);
     }
 }
 

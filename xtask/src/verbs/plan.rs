@@ -19,7 +19,7 @@ use serde_json::{Value, json};
 use super::evaluate::Driving;
 use super::explain;
 use crate::cli::WrongArguments;
-use crate::films::FilmArgs;
+use crate::films::{self, FilmArgs};
 use crate::planners::{ImaginationArgs, planner};
 use crate::run::{Common, Run, stop_if_interrupted};
 use crate::sampling::Sampling;
@@ -212,11 +212,7 @@ impl Args {
         let milliseconds = timed.milliseconds_per_step();
         let scenario = case.recording.scenario();
         run.phase("write", |run| {
-            let traffic = match &self.world {
-                WorldName::Model(_) => "learned traffic".to_owned(),
-                other => other.to_string(),
-            };
-            let label = format!("{} among {traffic}", self.planner.name());
+            let label = films::label(&self.planner.name(), &self.world);
             self.film
                 .write(run, scenario, &[(&label, &scored.driven.rollout)])?;
             write_candidates(run, &noted.steps)?;

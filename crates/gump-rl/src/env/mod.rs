@@ -10,7 +10,7 @@ mod traffic;
 
 use std::sync::Arc;
 
-use gump_scene::Seed;
+use gump_scene::{Frame, Seed};
 use rayon::prelude::*;
 
 use crate::observation::Observed;
@@ -188,6 +188,13 @@ impl<'w> DrivingEnv<'w> {
     /// The episode in progress in a row; `None` if there is no such row or no episode yet.
     pub fn episode(&self, row: usize) -> Option<(EpisodeStart, &EpisodeState)> {
         self.rows.get(row).map(|row| (row.start, &row.state))
+    }
+
+    /// All agents of the episode in progress in a row, as they are now; `None` if there is no such row or
+    /// no episode yet.
+    pub fn frame(&self, row: usize) -> Option<Frame> {
+        let row = self.rows.get(row)?;
+        Some(row.frame(&self.prepared[row.start.scenario]))
     }
 
     /// [`VectorEnv::observations`] of rasters with one bit per pixel, for replay buffers; empty for

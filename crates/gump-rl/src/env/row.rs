@@ -102,6 +102,16 @@ impl EnvRow {
         Frame::new(agents.collect(), frame.lights().to_vec())
     }
 
+    /// All agents now, the ego where its episode has it.
+    pub(super) fn frame(&self, prepared: &PreparedScenario) -> Frame {
+        let logged = || prepared.logged(self.state.steps);
+        let now = self.imagined[0].as_ref().unwrap_or_else(logged);
+        let ego = self.state.ego;
+        let others = now.agents().iter().filter(|agent| agent.id != ego.id);
+        let agents = others.copied().chain([ego]).collect();
+        Frame::new(agents, now.lights().to_vec())
+    }
+
     /// Chooses the next episode of row number `i`.
     pub(super) fn draw(&mut self, i: usize, sampler: &Sampler) {
         let seed = self.seed.fork(self.n_episodes);

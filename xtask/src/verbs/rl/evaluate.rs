@@ -12,13 +12,16 @@ use gump_eval::datasets::Split;
 use gump_eval::results::{Entry, Header, ResultStore};
 use gump_eval::shard::Shard;
 use gump_eval::worlds::WorldName;
-use gump_rl::{Actor, EnvConfig, Episodes, EvaluatedPolicy, PreparedScenario, evaluate};
+use gump_rl::{
+    Actor, EnvConfig, Episodes, EvaluatedPolicy, PreparedScenario, evaluate, recorded_drive,
+};
 use serde::Serialize;
 use sha2::{Digest as _, Sha256};
 
 use super::columns::{DivergedPolicy, DriveRecord, Driven, Policy, Tested, report};
 use super::{Notes, PreparedSet, RlWorld, Settings, read};
 use crate::cli::WrongArguments;
+use crate::films;
 use crate::run::{Common, Run, stop_if_interrupted};
 use crate::sampling::Sampling;
 use crate::sharding::shard;
@@ -53,6 +56,9 @@ pub(crate) struct Args {
     /// Drives per scenario, each in other traffic of the same world
     #[arg(long, value_name = "N", default_value_t = 1)]
     repeats: usize,
+    /// Films of the first N scenarios, one per policy and world, in films/
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    films: usize,
     /// Evaluate shard K of N; auto: the shard that a cluster's variables name. Merge shards with
     /// `evaluate merge`
     #[arg(long, value_name = "K/N|auto", default_value = "1/1", value_parser = shard)]
@@ -115,7 +121,8 @@ impl Args {
             shard: self.shard,
             diverged: Vec::new(),
         };
-        test.execute(run, &set)
+        test.execute(run, &set)?;
+        test.film(run, &set, self.films)
     }
 
     /// Reads the policies; the environment is that of the config file, else that of the first.
@@ -242,6 +249,44 @@ impl Test<'_> {
                 .extend(drives.iter().map(|drive| DriveRecord::new(w, p, drive)));
         }
         Ok(drives.iter().map(|drive| drive.steps as u32).sum())
+    }
+
+    /// Films the first `n` scenarios of the shard, driven again as in the evaluation.
+    fn film(&self, run: &mut Run, set: &PreparedSet, n: usize) -> anyhow::Result<()> {
+        let own = (0..set.scenarios.len()).filter(|index| self.shard.holds(*index));
+        let filmed: Vec<usize> = own.take(n).collect();
+        if filmed.is_empty() {
+            return Ok(());
+        }
+        let folder = run.path("films");
+        std::fs::create_dir_all(&folder)?;
+        run.phase("film", |run| {
+            for (name, world) in &self.worlds {
+                for &index in driven_in(name, self.model_limit, &filmed) {
+                    for (p, candidate) in self.candidates.iter().enumerate() {
+                        stop_if_interrupted()?;
+                        let drive = recorded_drive(
+                            &set.scenarios,
+                            world.traffic(),
+                            self.env,
+                            candidate.driver(),
+                            (index, run.seed()),
+                        );
+                        let drive = drive.with_context(|| candidate.file.display().to_string())?;
+                        let label = films::label(&candidate.policy, name);
+                        let scenario = set.scenarios[index].scenario();
+                        let film = films::film(scenario, &[(label.as_str(), &drive)])?;
+                        let file = format!(
+                            "{index}-{p}-{}-{}.gif",
+                            candidate.policy,
+                            films::short(name)
+                        );
+                        film.save(&folder.join(file))?;
+                    }
+                }
+            }
+            Ok(())
+        })
     }
 
     fn tested(&self, run: &Run, set: &PreparedSet) -> anyhow::Result<Tested> {

@@ -213,7 +213,7 @@ fn film(run: &Run, drive: &VisitedDrive<'_>) -> Result<(), BoxError> {
     let (planner, world) = (drive.planner, drive.world);
     let folder = run.path("films");
     std::fs::create_dir_all(&folder)?;
-    let label = format!("{planner} among {world}");
+    let label = films::label(planner, world);
     let film = films::film(
         drive.case.recording.scenario(),
         &[(label.as_str(), &drive.scored.driven.rollout)],
@@ -222,7 +222,7 @@ fn film(run: &Run, drive: &VisitedDrive<'_>) -> Result<(), BoxError> {
         "{}-{}-{}.gif",
         drive.index,
         file_name(planner),
-        short(world)
+        films::short(world)
     );
     Ok(film.save(&folder.join(name))?)
 }
@@ -231,12 +231,4 @@ fn film(run: &Run, drive: &VisitedDrive<'_>) -> Result<(), BoxError> {
 fn file_name(name: &str) -> String {
     let plain = |c: char| if c.is_ascii_alphanumeric() { c } else { '-' };
     name.chars().map(plain).collect()
-}
-
-/// A world's name as part of a file's.
-fn short(world: &WorldName) -> String {
-    match world {
-        WorldName::Model(_) => "model".into(),
-        other => other.to_string(),
-    }
 }
