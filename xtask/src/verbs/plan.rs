@@ -212,7 +212,7 @@ impl Args {
         let milliseconds = timed.milliseconds_per_step();
         let scenario = case.recording.scenario();
         run.phase("write", |run| {
-            let label = films::label(&self.planner.name(), &self.world);
+            let label = films::label(self.planner.name(), &self.world);
             self.film
                 .write(run, scenario, &[(&label, &scored.driven.rollout)])?;
             write_candidates(run, &noted.steps)?;
