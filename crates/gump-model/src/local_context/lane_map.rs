@@ -293,59 +293,39 @@ impl LaneMap {
     }
 }
 
-/// Points by cell of a grid that holds all of them: those of cell `i` are `items[starts[i]..starts[i + 1]]`.
+/// Points by the cell of a grid that they are in, which is as large as they are far apart.
 #[derive(Debug, Default)]
 struct Cells {
-    /// The corner of the grid with the least coordinates.
-    corner: DVec2,
-    /// Numbers of cells along x and y; 0 if there is no point.
-    sides: [usize; 2],
-    starts: Vec<u32>,
+    /// Column and row of each point, in order.
+    cells: Vec<[i32; 2]>,
+    /// The points, in the same order.
     items: Vec<u32>,
 }
 
 impl Cells {
     fn new(points: impl Iterator<Item = DVec2>) -> Self {
-        let points: Vec<DVec2> = points.collect();
-        let Some((low, high)) = points.iter().fold(None, |bounds, &p| {
-            let (low, high) = bounds.unwrap_or((p, p));
-            Some((p.min(low), p.max(high)))
-        }) else {
-            return Self::default();
-        };
-        let of = |p: DVec2| ((p - low) / CELL_M).floor();
-        let sides = (of(high) + 1.0).to_array().map(|n| n as usize);
-        let cell = |p: DVec2| of(p).x as usize * sides[1] + of(p).y as usize;
-        let mut placed: Vec<(usize, u32)> = points.iter().map(|&p| cell(p)).zip(0..).collect();
+        let placed = points.map(|p| [p.x, p.y].map(cell));
+        let mut placed: Vec<([i32; 2], u32)> = placed.zip(0..).collect();
         placed.sort_unstable();
-        let mut starts = vec![0; sides[0] * sides[1] + 1];
-        placed.iter().for_each(|(cell, _)| starts[cell + 1] += 1);
-        for i in 1..starts.len() {
-            starts[i] += starts[i - 1];
-        }
-        Self {
-            corner: low,
-            sides,
-            starts,
-            items: placed.into_iter().map(|(_, i)| i).collect(),
-        }
+        let (cells, items) = placed.into_iter().unzip();
+        Self { cells, items }
     }
 
     fn near(&self, position: DVec2, radius: f64) -> impl Iterator<Item = u32> {
-        let span = |x: f64, corner: f64, side: usize| {
-            let cell = |x: f64| ((x - corner) / CELL_M).floor().clamp(-1.0, side as f64);
-            let (low, high) = (cell(x - radius), cell(x + radius) + 1.0);
-            low.max(0.0) as usize..(high as usize).min(side)
-        };
-        let xs = span(position.x, self.corner.x, self.sides[0]);
-        let ys = span(position.y, self.corner.y, self.sides[1]);
-        let runs = xs.map(move |x| {
-            let at = |y: usize| self.starts[x * self.sides[1] + y] as usize;
-            match ys.is_empty() {
-                true => &[][..],
-                false => &self.items[at(ys.start)..at(ys.end)],
-            }
+        let span = |x: f64| (cell(x - radius), cell(x + radius));
+        let ((left, right), (bottom, top)) = (span(position.x), span(position.y));
+        // Columns without points are left out, however far one looks.
+        let ends = self.cells.first().zip(self.cells.last());
+        let columns = ends.map(|([first, _], [last, _])| left.max(*first)..=right.min(*last));
+        let runs = columns.into_iter().flatten().map(move |x| {
+            let from = self.cells.partition_point(|at| *at < [x, bottom]);
+            let to = self.cells.partition_point(|at| *at <= [x, top]);
+            &self.items[from..to]
         });
         runs.flatten().copied()
     }
+}
+
+fn cell(x: f64) -> i32 {
+    (x / CELL_M).floor() as i32
 }
