@@ -97,3 +97,83 @@ pub fn lanes_under(streets: &MapGraph, pose: Pose) -> impl Iterator<Item = (&Lan
         (angle_difference(way, pose.heading).abs() <= IN_LANE).then_some((lane, at, distance))
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use gump_geometry::DVec2;
+    use gump_model::relative::graph::Body;
+    use gump_model::relative::route::Traveller;
+    use gump_scene::{AgentKind, LaneId, Seed, fixture};
+
+    use super::*;
+
+    /// A road that goes on and turns left by a right angle of 12 m.
+    fn fork() -> MapGraph {
+        let turn = (0..=12).map(|i| {
+            let angle = f64::from(i) / 12.0 * std::f64::consts::FRAC_PI_2;
+            format!(" {},{}", 12.0 * angle.sin(), 12.0 * (1.0 - angle.cos()))
+        });
+        let text = format!(
+            "lane 1: -80,0 0,0 next 2,3\nlane 2: 0,0 80,0\nlane 3:{} 12,60\nego vehicle 0: -80,0",
+            turn.collect::<String>()
+        );
+        let map = fixture::scenario(&text).unwrap().map;
+        MapGraph::new(map.parts().clone()).unwrap()
+    }
+
+    fn car(x: f64, y: f64, speed: f64) -> Shown {
+        let body = Body {
+            kind: AgentKind::Vehicle,
+            length: 4.5,
+            width: 2.0,
+            sized: true,
+        };
+        Shown::first(body, Pose::new(x, y, 0.0), DVec2::new(speed, 0.0))
+    }
+
+    #[test]
+    fn bends_limit_the_speed_on_the_way_that_is_meant() {
+        let map = fork();
+        let bound_for = |now: &Shown, lane: i64| {
+            let who = |seed: u64| Traveller {
+                pose: now.pose,
+                speed: 6.0,
+                seed: Seed(seed),
+            };
+            let routes = (0..64).filter_map(|seed| Route::from_here(&map, who(seed)));
+            let mut routes = routes.filter(|route| route.lanes().contains(&LaneId(lane)));
+            routes.next().unwrap()
+        };
+        let now = car(-20.0, 0.0, 12.0);
+        let speed = |lane: i64| speed_for_bends(&map, &now, Some(&bound_for(&now, lane)));
+        // The root of 5 m/s² · 12 m in the bend, and 4 m/s² over the 20 m before it, give or take a step.
+        let braked = |metres: f64| (60.0 + 8.0 * metres).sqrt();
+        assert!(
+            (braked(16.0)..=braked(24.5)).contains(&speed(3)),
+            "{}",
+            speed(3)
+        );
+        assert!(speed(2).is_infinite());
+        // Without a route any way may be meant; slow vehicles and those on no lane are left alone.
+        assert!(speed_for_bends(&map, &now, None).is_infinite());
+        let slow = car(-2.0, 0.0, 2.0);
+        assert!(speed_for_bends(&map, &slow, Some(&bound_for(&slow, 3))).is_infinite());
+        assert!(speed_for_bends(&map, &car(-20.0, 5.0, 12.0), None).is_infinite());
+    }
+
+    #[test]
+    fn who_is_off_its_route_may_take_any_way() {
+        let map = fork();
+        let start = car(-20.0, 0.0, 12.0);
+        let who = |seed: u64| Traveller {
+            pose: start.pose,
+            speed: 6.0,
+            seed: Seed(seed),
+        };
+        let routes = (0..64).filter_map(|seed| Route::from_here(&map, who(seed)));
+        let mut turns = routes.filter(|route| route.lanes().contains(&LaneId(3)));
+        let route = turns.next().unwrap();
+        let on = car(40.0, 0.0, 12.0);
+        assert!(speed_for_bends(&map, &on, Some(&route)).is_infinite());
+    }
+}

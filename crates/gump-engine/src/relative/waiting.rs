@@ -19,6 +19,9 @@
 //! * Agents hold within 5 m, the free path that a start needs; in the other two within 12 and 15 m,
 //!   so that all of a queue has a reason.
 //! * Bicycles, and agents that were seen to drive, count as in a lane farther from its centre.
+//!
+//! Vehicles that are about to stop for nothing are found by the same question, and people whom a vehicle
+//! waits for.
 
 use gump_geometry::{DVec2, angle_difference};
 use gump_model::relative::route::Route;

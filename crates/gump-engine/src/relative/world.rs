@@ -633,16 +633,17 @@ impl Future {
         let shortest = if is_late { CLEARS_S } else { PATIENCE_S[0] };
         let map = &self.scene.source;
         let mut limits = Vec::with_capacity(self.members.len());
-        let mut is_one_waiting = false;
+        // Late, vehicles that only roll may be in it, too.
+        let mut is_one_idle = is_late;
         for member in &mut self.members {
             member.could_go = false;
             member.backing = member.backing.saturating_sub(1);
             member.let_pass = member.let_pass.saturating_sub(1);
-            is_one_waiting |= is_late || member.idle_s() > shortest;
+            is_one_idle |= member.idle_s() > shortest;
             let is_long = member.waited > WAITED_S && stands_in_lane(map, &member.agent);
             limits.push(is_long.then_some(WAITED_S));
         }
-        if is_one_waiting {
+        if is_one_idle {
             let members = self.members.iter().map(|member| Standing {
                 agent: member.agent,
                 waited_s: member.idle_s(),

@@ -1,4 +1,4 @@
-//! Futures of the shipped weights: routes.
+//! Futures of the shipped weights: routes, and what rules do.
 
 use gump_model::relative::route::Route;
 use gump_scene::{LaneId, Scenario, fixture};
@@ -8,6 +8,14 @@ use super::*;
 fn world(routes: Routes) -> RelativeWorld {
     sampled(RelativeSampling {
         routes,
+        ..RelativeSampling::default()
+    })
+}
+
+fn ruled() -> RelativeWorld {
+    sampled(RelativeSampling {
+        redraws: 12,
+        limits: true,
         ..RelativeSampling::default()
     })
 }
@@ -106,12 +114,7 @@ fn stuck() -> Scenario {
 
 #[test]
 fn one_of_two_that_hold_each_other_in_a_junction_backs_up() {
-    let rules = RelativeSampling {
-        redraws: 12,
-        limits: true,
-        ..RelativeSampling::default()
-    };
-    let (world, scenario) = (sampled(rules), stuck());
+    let (world, scenario) = (ruled(), stuck());
     let at = |future: &Future, i: usize| future.members[i].now().pose.position;
     let mut backed = 0;
     for seed in 0..8 {
@@ -149,11 +152,6 @@ fn towards_the_edge(place: DVec2) -> Scenario {
 
 #[test]
 fn rules_keep_vehicles_on_the_road_wherever_the_map_is() {
-    let rules = RelativeSampling {
-        redraws: 12,
-        limits: true,
-        ..RelativeSampling::default()
-    };
     let leave = |world: &RelativeWorld, place: DVec2| {
         let scenario = towards_the_edge(place);
         let leaves = |seed: &u64| {
@@ -166,7 +164,7 @@ fn rules_keep_vehicles_on_the_road_wherever_the_map_is() {
         };
         (0..32).filter(leaves).count()
     };
-    let (alone, ruled) = (sampled(RelativeSampling::default()), sampled(rules));
+    let (alone, ruled) = (sampled(RelativeSampling::default()), ruled());
     for place in [
         DVec2::ZERO,
         DVec2::new(-300.0, 200.0),
@@ -182,12 +180,7 @@ fn rules_keep_vehicles_on_the_road_wherever_the_map_is() {
 
 #[test]
 fn lights_that_are_shown_later_stop_vehicles_too() {
-    let rules = RelativeSampling {
-        redraws: 12,
-        limits: true,
-        ..RelativeSampling::default()
-    };
-    let (world, scenario) = (sampled(rules), fork());
+    let (world, scenario) = (ruled(), fork());
     let lit = fixture::scenario(
         "lane 2: 0,0 30,0\nlane 3: 0,0 30,1\nlight 2 red: 0,0\nlight 3 red: 0,0
          ego vehicle 0: -32,0",
