@@ -1,6 +1,6 @@
 //! Films of what was simulated: formats, cameras, panels.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use gump_eval::worlds::WorldName;
 use gump_scene::{Rollout, Scenario, SceneState};
@@ -201,10 +201,13 @@ pub(crate) fn label(driver: &str, world: &WorldName) -> String {
     }
 }
 
-/// A world's name as part of that of a film's file.
+/// A world's name as part of that of a film's file: of a model that of its weights.
 pub(crate) fn short(world: &WorldName) -> String {
     match world {
-        WorldName::Model(_) => "model".into(),
+        WorldName::Model(weights) => Path::new(weights).file_stem().map_or_else(
+            || "model".into(),
+            |stem| stem.to_string_lossy().into_owned(),
+        ),
         other => other.to_string(),
     }
 }
