@@ -1,11 +1,13 @@
 //! Where vehicles mean to go in a rollout: drawn once, and kept.
 
+use gump_model::relative::driveway::Driveways;
 use gump_model::relative::graph::Shown;
 use gump_model::relative::route::{Route, Traveller};
 use gump_model::steps::TOKEN_DT;
-use gump_scene::{AgentKind, Lane, MapGraph, Seed};
+use gump_scene::{Agent, AgentKind, Lane, LaneId, MapGraph, Seed};
 
 use crate::nucleus::uniform;
+use crate::relative::turning_in::{TakesWay, decide};
 
 // All were chosen by hand.
 
@@ -23,6 +25,8 @@ const THERE_M: f64 = 0.6;
 const GIVES_UP_S: f64 = 8.0;
 /// Separates decisions to change lane from those where lanes part.
 const CHANGES: u64 = 1 << 32;
+/// ... and those to turn into a driveway.
+const DRIVEWAYS: u64 = 1 << 33;
 
 /// Where a vehicle means to go.
 #[derive(Clone, Debug, Default)]
@@ -30,6 +34,8 @@ pub(super) struct Intent {
     route: Option<Route>,
     /// Time since it decided to change lane, seconds, until it is there.
     changing_s: Option<f64>,
+    /// The way into a driveway that it takes.
+    turns_in: Option<LaneId>,
 }
 
 impl Intent {
@@ -38,9 +44,38 @@ impl Intent {
         self.route.as_ref()
     }
 
+    /// The way into a driveway that it takes.
+    pub(super) fn turns_in(&self) -> Option<LaneId> {
+        self.turns_in
+    }
+
+    /// Decides to take a way into a driveway, keeps to it, or gives it up, half a second later; `seed` is
+    /// the agent's own. Returns whether its route has changed.
+    pub(super) fn turn_in<'a>(
+        &mut self,
+        driveways: &Driveways,
+        now: &Shown,
+        seed: Seed,
+        others: impl Iterator<Item = &'a Agent> + Clone,
+    ) -> bool {
+        if let Some(way) = self.turns_in {
+            let keeps = TakesWay::of(driveways, way).is_some_and(|way| !way.is_lost(now));
+            if !keeps {
+                *self = Self::default();
+            }
+            return !keeps;
+        }
+        self.turns_in = decide(driveways, now, seed.fork(DRIVEWAYS), others);
+        if let Some(lane) = self.turns_in {
+            self.route = Some(Route::into_driveway(lane));
+            self.changing_s = None;
+        }
+        self.turns_in.is_some()
+    }
+
     /// Half a second later. `seed` is the agent's own, `frame` the index of the frame.
     pub(super) fn go_on(&mut self, map: &MapGraph, now: &Shown, seed: Seed, frame: usize) {
-        if now.body.kind != AgentKind::Vehicle {
+        if now.body.kind != AgentKind::Vehicle || self.turns_in.is_some() {
             return;
         }
         let who = Traveller {
@@ -116,7 +151,7 @@ impl Intent {
 mod tests {
     use gump_geometry::{DVec2, Pose};
     use gump_model::relative::graph::Body;
-    use gump_scene::{LaneId, Scenario};
+    use gump_scene::Scenario;
 
     use super::*;
 
@@ -189,6 +224,7 @@ mod tests {
         let mut intent = Intent {
             route: Some(Route::into_lane(map, LaneId(2), who)),
             changing_s: Some(0.0),
+            turns_in: None,
         };
         for frame in 0..18 {
             let x = 50.0 + 4.0 * f64::from(frame);

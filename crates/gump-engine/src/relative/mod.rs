@@ -8,6 +8,7 @@ pub mod keep_clear;
 pub mod right_of_way;
 pub mod rules;
 pub mod seen;
+mod turning_in;
 mod waiting;
 mod world;
 

@@ -13,6 +13,7 @@ use gump_scene::{Lane, LightState, MapGraph};
 use crate::relative::approach::{
     OVER_M, ROLLS_MPS, before_line, has_sign, lane_under, slowing_before,
 };
+use crate::relative::turning_in::TakesWay;
 
 // All were chosen by hand.
 
@@ -91,6 +92,17 @@ pub fn courses(
     let mut courses: Vec<Course> = all.iter().map(course).collect();
     courses.sort_by(|a, b| a.turn.abs().total_cmp(&b.turn.abs()));
     courses
+}
+
+/// The way of a vehicle into a driveway: before the turn it waits where it leaves the street, in the turn
+/// it is in the way of those that come.
+pub(super) fn course_in(way: TakesWay<'_>, lights: &Lights, now: &Shown) -> Course {
+    let at = way.at(now);
+    let mut course = course(&MapGraph::default(), lights, now, &[way.lane], at);
+    let room = way.way.turns_off_m - at;
+    course.is_inside = room < -OVER_M;
+    course.line_m = (!course.is_inside).then_some(room + now.body.length / 2.0);
+    course
 }
 
 /// Collects the ways from the last lane of `way`, which ends `metres` ahead.

@@ -19,7 +19,8 @@ use crate::kinematic_limits::Limits;
 use crate::rejection::{BRAKING, Footprints, Member, POSES, Way, way};
 use crate::relative::approach::{HARDEST_MPS2, OVER_M, speed_for_bends};
 use crate::relative::keep_clear::closed_entry;
-use crate::relative::right_of_way::{Course, courses, speed_for_signs, yielding_speed};
+use crate::relative::right_of_way::{Course, course_in, courses, speed_for_signs, yielding_speed};
+use crate::relative::turning_in::TakesWay;
 
 // The thresholds are chosen by hand; none has been varied in a measurement.
 
@@ -253,6 +254,8 @@ pub(super) struct Known<'r> {
     pub(super) stands_back: bool,
     /// Where it means to go.
     pub(super) route: Option<&'r Route>,
+    /// The way into a driveway that it takes.
+    pub(super) turns_in: Option<TakesWay<'r>>,
 }
 
 impl<'l> Shut<'l> {
@@ -275,6 +278,10 @@ impl<'l> Shut<'l> {
             Some(StopLine::at_end(lane))
         };
         let ways = |i: usize| match agents[i].body.kind {
+            AgentKind::Vehicle if known[i].turns_in.is_some() => {
+                let way = known[i].turns_in.into_iter();
+                way.map(|way| course_in(way, colours, &agents[i])).collect()
+            }
             AgentKind::Vehicle | AgentKind::Bicycle if comes(i) => {
                 courses(map, colours, &agents[i], known[i].route)
             }
@@ -287,7 +294,10 @@ impl<'l> Shut<'l> {
             let yielding = yielding_speed(&ways[i], &others.map(|(_, way)| &way[..]));
             let least = yielding.min(speed_for_signs(&ways[i]));
             match agents[i].body.kind {
-                AgentKind::Vehicle => least.min(speed_for_bends(map, &agents[i], known[i].route)),
+                AgentKind::Vehicle => least.min(match &known[i].turns_in {
+                    Some(way) => way.most(&agents[i]),
+                    None => speed_for_bends(map, &agents[i], known[i].route),
+                }),
                 _ => least,
             }
         };
@@ -409,11 +419,11 @@ pub struct Driven {
 }
 
 /// Redraws moves that are not clear, up to `redraws` times each; an agent without a clear path
-/// brakes.
+/// brakes. Vehicles may not leave the road, except where `may_leave` holds for their index.
 pub fn resolve(
     agents: &[Shown],
     driven: Option<Driven>,
-    lane_map: &LaneMap,
+    (lane_map, may_leave): (&LaneMap, &dyn Fn(usize) -> bool),
     redraws: usize,
     moves: &mut [Pose],
     again: &mut Again<'_>,
@@ -433,7 +443,7 @@ pub fn resolve(
             );
             member.walks = now.body.kind == AgentKind::Pedestrian;
             member.is_ignored = is_driven(i).is_some_and(|driven| !driven.is_heeded);
-            if now.body.kind == AgentKind::Vehicle && !member.is_driven {
+            if now.body.kind == AgentKind::Vehicle && !member.is_driven && !may_leave(i) {
                 member.look_for_edges(lane_map);
             }
             member
@@ -534,7 +544,7 @@ mod tests {
         resolve(
             &agents,
             None,
-            &lane_map,
+            (&lane_map, &|_| false),
             4,
             &mut moves,
             &mut |who, attempt| {
@@ -554,9 +564,14 @@ mod tests {
         let lane_map = LaneMap::default();
         let settled = |driven: Option<Driven>| {
             let mut moves = [straight(4.0), Pose::IDENTITY];
-            resolve(&agents, driven, &lane_map, 2, &mut moves, &mut |who, _| {
-                who.iter().map(|_| straight(4.0)).collect()
-            });
+            resolve(
+                &agents,
+                driven,
+                (&lane_map, &|_| false),
+                2,
+                &mut moves,
+                &mut |who, _| who.iter().map(|_| straight(4.0)).collect(),
+            );
             moves
         };
         // 8 m/s, braking at 5 m/s² for half a second.
@@ -574,7 +589,7 @@ mod tests {
             resolve(
                 &agents,
                 driven(1, yields),
-                &lane_map,
+                (&lane_map, &|_| false),
                 2,
                 &mut moves,
                 &mut |_, _| vec![straight(1.0)],

@@ -16,6 +16,7 @@ use gump_kernels::panels::Precision;
 use gump_model::ModelError;
 use gump_model::local_context::LaneMap;
 use gump_model::relative::RelativeWeights;
+use gump_model::relative::driveway::Driveways;
 use gump_model::relative::graph::{Body, Lights, Shown};
 use gump_model::relative::grid::{FIELDS, dequantize};
 use gump_model::relative::map::{Hidden, VectorMap};
@@ -38,6 +39,7 @@ use crate::relative::rules::{
     Driven, Known, Shut, StopLine, kinematically_limited, obey_lines, resolve, start,
 };
 use crate::relative::seen::{FrameIndex, ObservedAgent, add_presents};
+use crate::relative::turning_in::TakesWay;
 use crate::relative::waiting::{CLEARS_S, Standing, has_room_behind, released};
 use crate::sampling::{Routes, SamplingConfig};
 
@@ -305,6 +307,8 @@ pub(super) struct Scene {
     pub memory: MapMemory,
     /// The edges of the road, where rules look at them.
     pub lane_map: LaneMap,
+    /// The ways into driveways, under the rules.
+    driveways: Driveways,
     ego: AgentId,
     /// The lights that it may show.
     lights: Vec<Light>,
@@ -331,14 +335,21 @@ impl Scene {
         (ego, lights): (AgentId, &[Light]),
         sampling: &RelativeSampling,
     ) -> Self {
-        let map = VectorMap::around(&source, &centres, MAP_M, Hidden::default());
+        let mut map = VectorMap::around(&source, &centres, MAP_M, Hidden::default());
+        let lane_map = match sampling.redraws {
+            0 => LaneMap::default(),
+            _ => LaneMap::of_curbs(&source, &centres, MAP_M),
+        };
+        let driveways = match sampling.redraws > 0 && sampling.routes != Routes::Never {
+            true => Driveways::around(&source, &lane_map, &centres, MAP_M),
+            false => Driveways::default(),
+        };
+        map.add_driveways(&driveways, &centres, MAP_M);
         Self {
             memory: engine.remember(&map),
             map,
-            lane_map: match sampling.redraws {
-                0 => LaneMap::default(),
-                _ => LaneMap::of_curbs(&source, &centres, MAP_M),
-            },
+            lane_map,
+            driveways,
             source,
             centres,
             ego,
@@ -590,6 +601,9 @@ impl Future {
             Routes::Late => self.is_late(),
             Routes::Always => true,
         };
+        if self.scene.routes != Routes::Never {
+            self.turn_into_driveways(ego.map(|_| id));
+        }
         if has_routes {
             self.choose_ways(ego.map(|_| id));
         }
@@ -602,6 +616,26 @@ impl Future {
         }
         self.lights_now.clone_from(&self.lights);
         self.limit_waiting(engine, ego.map(|_| id));
+    }
+
+    /// Lets vehicles turn into driveways, under the rules.
+    fn turn_into_driveways(&mut self, driven: Option<AgentId>) {
+        let driveways = &self.scene.driveways;
+        if driveways.ways.is_empty() {
+            return;
+        }
+        let seed = self.seed.fork(ROUTES);
+        let agents: Vec<Agent> = self.members.iter().map(|member| member.agent).collect();
+        let members = self.members.iter_mut();
+        for member in members.filter(|member| driven != Some(member.agent.id)) {
+            let id = member.agent.id;
+            let others = agents.iter().chain(&self.others);
+            let others = others.filter(|other| other.id != id);
+            let (now, stream) = (member.now(), seed.fork(id.0 as u64));
+            if member.intent.turn_in(driveways, &now, stream, others) {
+                member.seen.head_for(member.intent.route().cloned());
+            }
+        }
     }
 
     /// Lets vehicles keep to their routes, and gives one to those without; a driven ego has its own.
@@ -748,11 +782,14 @@ impl Future {
                 .collect(),
         };
         let unheeded = driven.filter(|_| !sampling.yields_to_driven);
+        let driveways = &self.scene.driveways;
+        let turns_in = |member: &Member| TakesWay::of(driveways, member.intent.turns_in()?);
         let known = self.members.iter().enumerate().map(|(i, member)| Known {
             is_unheeded: unheeded == Some(i),
             is_parked: member.waited > PATIENCE_S[0] && !member.has_driven,
             stands_back: member.backing > 0,
             route: member.intent.route(),
+            turns_in: turns_in(member),
         });
         let known: Vec<Known<'_>> = known.collect();
         let shut = Shut::of(&self.scene.source, &agents, &known, lines, &colours);
@@ -772,7 +809,12 @@ impl Future {
             is_heeded: sampling.yields_to_driven,
         });
         self.back_up(&mut moves);
-        resolve(&agents, driven, lane_map, redraws, &mut moves, &mut lawful);
+        let may_leave = |i: usize| {
+            let way = &known[i].turns_in;
+            way.is_some_and(|way| way.leaves_street(&agents[i]))
+        };
+        let edges = (lane_map, &may_leave as &dyn Fn(usize) -> bool);
+        resolve(&agents, driven, edges, redraws, &mut moves, &mut lawful);
         self.back_up(&mut moves);
         moves
     }

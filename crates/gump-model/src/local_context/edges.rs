@@ -4,7 +4,7 @@
 //! in the metric `gump_metrics::DistanceToRoadEdge`. Here it is cut into stretches of at most a
 //! metre and a half, so that few are near a box.
 
-use gump_geometry::{DVec2, OrientedBox, Polyline, Pose, project_on_segment};
+use gump_geometry::{DVec2, OrientedBox, Polyline, Pose, project_on_segment, segments_intersect};
 
 /// Length of a stretch of a road edge, metres: kerbs bend, and few stretches are near a box. Chosen
 /// by hand.
@@ -42,6 +42,11 @@ impl Edge {
             open: [is_open && i == 0, is_open && i + 2 == n],
         };
         (0..n - 1).map(stretch).collect()
+    }
+
+    /// Whether a straight way crosses it.
+    pub(crate) fn crosses(&self, from: DVec2, to: DVec2) -> bool {
+        segments_intersect(self.from, self.to, from, to)
     }
 
     /// Signed distance of a point to the right of the line through the stretch, metres; negative on

@@ -123,6 +123,12 @@ impl Shown {
         DVec2::from_angle(began).rotate(self.step.position) / TOKEN_DT
     }
 
+    /// Change of its speed, metres per second squared; 0 where too little was observed.
+    pub fn acceleration(&self) -> f64 {
+        let faster = |earlier: Pose| self.step.position.length() - earlier.position.length();
+        self.earlier.map_or(0.0, faster) / (TOKEN_DT * TOKEN_DT)
+    }
+
     fn stands(&self) -> bool {
         self.step.position == DVec2::ZERO
     }

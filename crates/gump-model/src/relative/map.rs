@@ -8,6 +8,7 @@ use std::collections::BTreeMap;
 use gump_geometry::{DVec2, Pose, angle_difference};
 use gump_scene::{AreaKind, LaneId, LaneKind, MapGraph, RoadEdgeKind};
 
+use crate::relative::driveway::Driveways;
 use crate::relative::graph::Axes;
 
 // What the network sees of a map: chosen by hand, not tuned, and fixed by its weights.
@@ -202,6 +203,30 @@ impl VectorMap {
         for (last, id) in lasts {
             let next = map.successors(id).filter_map(|lane| firsts.get(&lane.id));
             self.pieces[last as usize].next.extend(next);
+        }
+    }
+
+    /// Adds the lanes of these ways within `reach` metres of one of these points, out of view of all but
+    /// those whose route they are.
+    pub fn add_driveways(&mut self, driveways: &Driveways, centres: &[DVec2], reach: f64) {
+        for lane in driveways.map.lanes() {
+            let line = &lane.centerline;
+            if !is_near(line.point_at(0.5 * line.length()), centres, reach) {
+                continue;
+            }
+            let n = (line.length() / LANE_PIECE_M).ceil().max(1.0) as usize;
+            for i in 0..n {
+                let mut piece = piece(line, i, n, PieceKind::Lane, Some(lane.id));
+                piece.starts_lane = i == 0;
+                let mut rest = [0.0; REST];
+                rest[lane_index(lane.kind)] = 1.0;
+                rest[13] = lane.speed_limit.map_or(0.0, |limit| (limit / 15.0) as f32);
+                rest[14] = f32::from(u8::from(lane.speed_limit.is_none()));
+                rest[18] = (lane.width / 4.0) as f32;
+                rest[23] = f32::from(u8::from(i == 0));
+                let index = self.push(piece, rest);
+                self.by_lane.entry(lane.id).or_default().push(index);
+            }
         }
     }
 

@@ -6,12 +6,14 @@
 //! valid. The final vector of a node predicts the next half second of its agent, in the agent's own
 //! frame.
 //!
-//! `map` cuts the map into pieces, `route` says which lanes a vehicle means to follow, `graph` builds
+//! `map` cuts the map into pieces, `route` says which lanes a vehicle means to follow, `driveway` adds
+//! lanes into driveways, `graph` builds
 //! nodes and edges, `grid` has the bins of a move, `sample` the training samples, `net` the network,
 //! `preference` its loss on moves that are rewarded, `weights` its parameters without a tensor library,
 //! `store` its files. Rollouts are in `gump-engine`, training is in `gump-train`.
 
 mod config;
+pub mod driveway;
 pub mod graph;
 pub mod grid;
 pub mod map;

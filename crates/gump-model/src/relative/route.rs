@@ -120,6 +120,14 @@ impl Route {
         Some(Self::extended(map, vec![best.lane.id], who))
     }
 
+    /// The route of a vehicle that means to turn into a driveway: a lane of
+    /// [`Driveways`](crate::relative::driveway::Driveways).
+    pub fn into_driveway(lane: LaneId) -> Self {
+        Self {
+            lanes: Arc::new([lane]),
+        }
+    }
+
     /// The route of a vehicle that means to change to `lane`, which is beside it.
     pub fn into_lane(map: &MapGraph, lane: LaneId, who: Traveller) -> Self {
         Self::extended(map, from_beside(map, lane, who.pose), who)

@@ -386,7 +386,14 @@ impl NetworkDriver {
         }
         let mut again = |who: &[usize], attempt: usize| drawn(who, attempt + 1);
         let redraws = self.config.redraws;
-        resolve(agents, None, lane_map, redraws, &mut moves, &mut again);
+        resolve(
+            agents,
+            None,
+            (lane_map, &|_| false),
+            redraws,
+            &mut moves,
+            &mut again,
+        );
         moves
     }
 
