@@ -7,6 +7,7 @@
 //! edge: 0,-2 100,-2
 //! line: 0,2 100,2
 //! crosswalk: 40,-2 44,-2 44,2 40,2
+//! driveway: 60,-2 64,-2 64,-10 60,-10
 //! drivable: 0,-2 100,-2 100,2 0,2
 //! light 1 red: 38,0
 //! route 1,2
@@ -130,10 +131,14 @@ impl Draft {
                     elevation,
                 });
             }
-            ["crosswalk"] => {
+            [area @ ("crosswalk" | "driveway")] => {
                 let polygon = Polygon::new(points(body)?).ok_or("fewer than 3 points")?;
                 let id = 2_000_000 + self.parts.areas.len() as i64;
-                let area = Area::new(id, AreaKind::Crosswalk, polygon);
+                let kind = match *area {
+                    "driveway" => AreaKind::Driveway,
+                    _ => AreaKind::Crosswalk,
+                };
+                let area = Area::new(id, kind, polygon);
                 self.parts.areas.push(area);
             }
             ["drivable"] => {

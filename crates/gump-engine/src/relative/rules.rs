@@ -409,6 +409,16 @@ pub(super) fn start(mut standing: Vec<usize>, moves: &mut [Pose], again: &mut Ag
     }
 }
 
+/// Draws the moves of these agents once more, whatever comes.
+pub(super) fn once_more(who: &[usize], moves: &mut [Pose], again: &mut Again<'_>) {
+    if who.is_empty() {
+        return;
+    }
+    for (&i, step) in who.iter().zip(again(who, STARTS + 1)) {
+        moves[i] = step;
+    }
+}
+
 /// An agent that is driven from outside.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Driven {

@@ -59,16 +59,19 @@ impl Driveways {
     /// Those of a map within `reach` metres of one of these places, `curbs` being its edges there.
     pub fn around(map: &MapGraph, curbs: &LaneMap, centres: &[DVec2], reach: f64) -> Self {
         let ids = map.lanes().iter().map(|lane| lane.id.0);
-        // A way keeps its id when the map is laid out around another place.
-        let first = ids.max().unwrap_or(0).saturating_add(1);
+        let last = ids.max().unwrap_or(0);
         let (mut ways, mut lanes) = (Vec::new(), Vec::new());
-        for (area, id) in map.areas().iter().zip((first..).step_by(2)) {
+        for (area, i) in map.areas().iter().zip(0i64..) {
+            // A way keeps its id when the map is laid out around another place.
+            let Some(id) = last.checked_add(2 * i + 2) else {
+                break;
+            };
             let is_near = |centre: &DVec2| area.polygon.ring()[0].distance(*centre) < reach;
             if area.kind != AreaKind::Driveway || !centres.iter().any(is_near) {
                 continue;
             }
             for (mut lane, turns_off_m, side) in ways_into(map, curbs, area) {
-                lane.id = LaneId(id + side as i64);
+                lane.id = LaneId(id - 1 + side as i64);
                 ways.push(WayIn {
                     lane: lane.id,
                     turns_off_m,
@@ -270,4 +273,111 @@ fn street_before(map: &MapGraph, lane: &Lane, at: f64, metres: f64) -> Option<Po
     }
     points.dedup_by(|a, b| a.distance(*b) < 1e-6);
     Polyline::new(points)
+}
+
+#[cfg(test)]
+mod tests {
+    use gump_scene::fixture;
+
+    use super::*;
+
+    /// A street of two lanes with a driveway to the south of it, and more.
+    fn driveways(rest: &str) -> (MapGraph, Driveways) {
+        let street = "lane 1: 0,0 50,0 speed 13 next 3
+             lane 3: 50,0 200,0 speed 13
+             lane 2: 200,3.5 0,3.5 speed 13
+             edge: 0,-2 200,-2
+             driveway: 58,-2.4 63,-2.4 63,-11 58,-11
+             ego vehicle 0: 10,0 velocity 8,0";
+        let scenario = fixture::scenario(&format!("{street}\n{rest}")).unwrap();
+        let map = MapGraph::clone(&scenario.map);
+        let curbs = LaneMap::of_curbs(&map, &[DVec2::ZERO], 300.0);
+        let found = Driveways::around(&map, &curbs, &[DVec2::ZERO], 300.0);
+        (map, found)
+    }
+
+    #[test]
+    fn ways_lead_from_both_lanes_into_the_driveway() {
+        let (map, found) = driveways("");
+        assert_eq!(found.ways.len(), 2);
+        for (way, (y, heading)) in found
+            .ways
+            .iter()
+            .zip([(0.0, 0.0), (3.5, std::f64::consts::PI)])
+        {
+            assert!(map.lane(way.lane).is_none(), "its id is its own");
+            assert_eq!(found.way(way.lane).map(|way| way.lane), Some(way.lane));
+            let line = &found.map.lane(way.lane).unwrap().centerline;
+            // Along the street up to the turn, over the lane before.
+            let off = line.pose_at(way.turns_off_m);
+            assert!((way.turns_off_m - APPROACH_M).abs() < 0.1, "{way:?}");
+            assert!((off.position.y - y).abs() < 1e-6 && line.points()[0].y == y);
+            assert!(angle_difference(line.pose_at(5.0).heading, heading).abs() < 1e-6);
+            assert!((off.position.x - 60.5).abs() - RADIUS_M < 0.3, "{off:?}");
+            // Square through the mouth, to the end of the driveway.
+            let end = line.pose_at(line.length());
+            assert!(angle_difference(end.heading, -std::f64::consts::FRAC_PI_2).abs() < 0.05);
+            assert!(
+                end.position.distance(DVec2::new(60.5, -11.0)) < 0.3,
+                "{end:?}"
+            );
+            let bends = (1..line.length() as usize).map(|s| {
+                let heading = |s: f64| line.pose_at(s).heading;
+                angle_difference(heading(s as f64), heading(s as f64 - 1.0)).abs()
+            });
+            assert!(bends.fold(0.0, f64::max) < 0.4, "no corner");
+        }
+    }
+
+    #[test]
+    fn a_curb_or_a_lane_between_bars_the_way() {
+        let lanes = |rest: &str| {
+            let (_, found) = driveways(rest);
+            let start = |way: &WayIn| found.map.lane(way.lane).unwrap().centerline.points()[0].y;
+            found.ways.iter().map(start).collect::<Vec<_>>()
+        };
+        assert_eq!(lanes(""), [0.0, 3.5]);
+        assert_eq!(lanes("edge: 0,1.75 200,1.75"), [0.0]);
+        // From the outer one of two lanes.
+        assert_eq!(lanes("lane 4: 200,7 0,7"), [0.0, 3.5]);
+        assert_eq!(lanes("lane 4: 0,-1.1 200,-1.1"), [-1.1, 3.5]);
+        // The rest is too narrow, too far away, or too near to the end of the street.
+        let around = |driveway: &str| lanes(&format!("driveway: {driveway}")).len();
+        assert_eq!(around("80,-2.4 82,-2.4 82,-11 80,-11"), 2);
+        assert_eq!(around("80,-14 85,-14 85,-24 80,-24"), 2);
+        assert_eq!(around("80,-2.4 85,-2.4 85,-5 80,-5"), 2);
+        assert_eq!(around("80,-2.4 85,-2.4 85,-11 80,-11"), 4);
+    }
+
+    #[test]
+    fn ids_do_not_depend_on_where_the_map_is_laid_out() {
+        let (map, all) = driveways("driveway: 150,-2.4 155,-2.4 155,-11 150,-11");
+        let far = DVec2::new(180.0, 0.0);
+        let curbs = LaneMap::of_curbs(&map, &[far], 60.0);
+        let there = Driveways::around(&map, &curbs, &[far], 60.0);
+        let ids = |found: &Driveways| found.ways.iter().map(|way| way.lane).collect::<Vec<_>>();
+        assert_eq!(ids(&all)[2..], ids(&there)[..]);
+        assert_eq!(there.ways.len(), 2);
+    }
+
+    #[test]
+    fn only_those_who_take_a_way_see_it() {
+        let (map, found) = driveways("");
+        let mut pieces =
+            crate::relative::map::VectorMap::new(&map, DVec2::ZERO, 300.0, Default::default());
+        let before = pieces.pieces.len();
+        pieces.add_driveways(&found, &[DVec2::ZERO], 300.0);
+        assert!(pieces.pieces.len() > before + 6);
+        let at = DVec2::new(52.0, 0.0);
+        assert!(pieces.near(at, 60.0).all(|i| (i as usize) < before));
+        let pose = gump_geometry::Pose::new(52.0, 0.0, 0.0);
+        let paths = pieces.paths(pose);
+        assert!(paths.iter().flatten().all(|(i, _)| (*i as usize) < before));
+        let way = &found.ways[0];
+        let route = crate::relative::route::Route::into_driveway(way.lane);
+        let path = route.path(&pieces, pose);
+        assert!(path.len() >= 3 && path.iter().all(|(i, _)| *i as usize >= before));
+        let (last, away) = path[path.len() - 1];
+        assert!(pieces.pieces[last as usize].pose.position.y < -5.0 && away > 10.0);
+    }
 }

@@ -211,3 +211,91 @@ fn lights_that_are_shown_later_stop_vehicles_too() {
         );
     }
 }
+
+/// A street with a driveway to the south, at which a vehicle arrives.
+fn driveway() -> Scenario {
+    fixture::scenario(
+        "lane 1: 0,0 120,0 speed 11
+         lane 2: 120,3.5 0,3.5 speed 11
+         edge: 0,-2 120,-2
+         edge: 120,5.5 0,5.5
+         driveway: 58,-2.4 63,-2.4 63,-12 58,-12
+         ego vehicle 0: 44,0 velocity 4.5,0 size 4.6,1.9",
+    )
+    .unwrap()
+}
+
+#[test]
+fn some_who_come_slowly_turn_into_a_driveway_and_stop_there() {
+    let (world, scenario) = (ruled(), driveway());
+    let turns_in = |seed: u64| {
+        let (future, _) = future(&world, &scenario, seed, 4);
+        future.members[0].intent.turns_in().is_some()
+    };
+    let n = 240;
+    let seeds: Vec<u64> = (0..n).filter(|seed| turns_in(*seed)).collect();
+    // 8 %, and those that have not come there yet.
+    assert!((8..30).contains(&seeds.len()), "{seeds:?}");
+    let mut there = 0;
+    for seed in &seeds {
+        let (future, _) = future(&world, &scenario, *seed, 40);
+        let now = future.members[0].now();
+        let (x, y) = (now.pose.position.x, now.pose.position.y);
+        there += usize::from((57.5..63.5).contains(&x) && (-12.0..-5.0).contains(&y));
+    }
+    assert!(10 * there >= 9 * seeds.len(), "{there} of {}", seeds.len());
+    // Raw, and without routes, nobody does.
+    for world in [
+        self::world(Routes::Late),
+        sampled(RelativeSampling {
+            redraws: 12,
+            limits: true,
+            routes: Routes::Never,
+            ..RelativeSampling::default()
+        }),
+    ] {
+        for seed in seeds.iter().take(5) {
+            let (future, _) = future(&world, &scenario, *seed, 6);
+            assert_eq!(future.members[0].intent.turns_in(), None);
+        }
+    }
+}
+
+#[test]
+fn halts_of_people_and_starts_of_parked_vehicles_are_drawn_again() {
+    let scenario = fixture::scenario(
+        "lane 1: 0,0 200,0 speed 13
+         ego vehicle 0: 20,0 velocity 8,0
+         agent pedestrian 1: 30,-6 velocity 1.3,0
+         agent pedestrian 2: 35,-6
+         agent vehicle 3: 60,-5
+         agent vehicle 4: 80,0
+         agent bicycle 5: 90,-4",
+    )
+    .unwrap();
+    let (future, _) = future(&ruled(), &scenario, 1, 0);
+    let share = |id: u32, step: Pose| {
+        let mut members = future.members.iter();
+        let member = members
+            .find(|member| member.agent.id.0 as u32 == id)
+            .unwrap();
+        let rare = |seed: &u64| member.is_rare(&scenario.map, step, Seed(*seed));
+        (0..400).filter(rare).count()
+    };
+    let (halt, go) = (Pose::IDENTITY, Pose::new(0.6, 0.0, 0.0));
+    assert!((290..350).contains(&share(1, halt)), "{}", share(1, halt));
+    assert!((290..350).contains(&share(3, go)), "{}", share(3, go));
+    // Who walks on, who stands, who drives, and who stands in a lane.
+    for (id, step) in [
+        (1, go),
+        (2, halt),
+        (2, go),
+        (3, halt),
+        (0, halt),
+        (0, go),
+        (4, go),
+        (5, go),
+    ] {
+        assert_eq!(share(id, step), 0, "{id} {step:?}");
+    }
+}
