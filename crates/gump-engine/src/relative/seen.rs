@@ -50,6 +50,13 @@ impl ObservedAgent {
         };
     }
 
+    /// Turns it on the spot to this heading, radians.
+    pub fn turn_to(&mut self, heading: f64) {
+        if let Some(now) = self.shown.last_mut() {
+            now.pose.heading = heading;
+        }
+    }
+
     /// Where it means to go, if the network is told.
     pub fn route(&self) -> Option<&Route> {
         self.route.as_ref()

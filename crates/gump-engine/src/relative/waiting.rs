@@ -23,7 +23,9 @@
 //! Vehicles that are about to stop for nothing are found by the same question, and people whom a vehicle
 //! waits for.
 
-use gump_geometry::{DVec2, angle_difference};
+use std::f64::consts::FRAC_PI_2;
+
+use gump_geometry::{DVec2, angle_difference, wrap_angle};
 use gump_model::relative::route::Route;
 use gump_scene::{Agent, AgentKind, Lane, LaneAhead, Light, LightState, MapGraph, lanes_ahead};
 
@@ -83,6 +85,12 @@ const BESIDE_IT_M: f64 = 0.3;
 /// After a benchmark's time people who have stood this long before a vehicle that has stood as long walk
 /// on, seconds.
 const BEFORE_VEHICLE_S: f64 = 2.0;
+/// One who is still there after so long cannot walk straight on, and turns to a side of the vehicle,
+/// seconds. These were chosen by hand.
+const ASIDE_S: f64 = 6.0;
+/// It does not walk where a vehicle stands within this of these places on its way, metres.
+const WALKING_ROOM_M: f64 = 0.4;
+const STEPS_ASIDE_M: [f64; 3] = [0.8, 1.6, 2.4];
 /// A vehicle no faster than this may come to a stop within a step, metres per second.
 const ROLLS_MPS: f64 = 4.0;
 /// Agents that wait for each other are within this, metres, and meet at more than this angle,
@@ -124,6 +132,9 @@ pub(super) struct Released {
     /// They stand in the way of others in a junction, as these in theirs, and have room to back up; with
     /// each these others.
     pub(super) back_up: Vec<(usize, Vec<usize>)>,
+    /// People who stand before a vehicle for so long that they turn away to one of its sides, with their new
+    /// heading, radians.
+    pub(super) aside: Vec<(usize, f64)>,
 }
 
 /// Returns the agents that have stood for longer than their patience and could go on, or back up.
@@ -184,9 +195,16 @@ pub(super) fn released(
             stuck.push(i);
         }
     }
-    if is_late {
-        people.extend(in_the_way(map, agents));
-    }
+    let in_the_way = match is_late {
+        true => in_the_way(map, agents),
+        false => Vec::new(),
+    };
+    people.extend(in_the_way.iter().map(|(person, _)| *person));
+    let aside = |&(i, j): &(usize, usize)| {
+        let is_long = agents[i].waited_s > ASIDE_S;
+        is_long.then(|| (i, way_aside(agents, i, &agents[j].agent)))
+    };
+    let aside = in_the_way.iter().filter_map(aside).collect();
     let rolls = |i: &usize| {
         let agent = &agents[*i].agent;
         let speed = agent.state.speed();
@@ -222,11 +240,12 @@ pub(super) fn released(
         go: next,
         roll,
         back_up: backing(map, agents, &stuck),
+        aside,
     }
 }
 
-/// People who stand on the path of a vehicle, both for [`BEFORE_VEHICLE_S`].
-fn in_the_way(map: &MapGraph, agents: &[Standing<'_>]) -> Vec<usize> {
+/// People who stand on the path of a vehicle, and that vehicle, both for [`BEFORE_VEHICLE_S`].
+fn in_the_way(map: &MapGraph, agents: &[Standing<'_>]) -> Vec<(usize, usize)> {
     let stand = |kind: AgentKind| {
         let all = agents.iter().enumerate();
         all.filter(move |(_, one)| one.agent.kind == kind && one.waited_s > BEFORE_VEHICLE_S)
@@ -241,11 +260,35 @@ fn in_the_way(map: &MapGraph, agents: &[Standing<'_>]) -> Vec<usize> {
                 !reached.is_empty() && holds(&reached, &one.agent, &person.agent, true, &USUAL)
             }
         };
-        if stand(AgentKind::Vehicle).any(|(_, one)| holds_one(one)) {
-            found.push(j);
-        }
+        let vehicle = stand(AgentKind::Vehicle).find(|(_, one)| holds_one(one));
+        found.extend(vehicle.map(|(i, _)| (j, i)));
     }
     found
+}
+
+/// The heading in which a person leaves the path of a vehicle: to the nearer side, if no vehicle stands
+/// there, else to the other one.
+fn way_aside(agents: &[Standing<'_>], person: usize, vehicle: &Agent) -> f64 {
+    let at = agents[person].agent.state.pose.position;
+    let vehicle = vehicle.state.pose;
+    let side = (vehicle.inverse() * at).y;
+    let to = |side: f64| wrap_angle(vehicle.heading + FRAC_PI_2.copysign(side));
+    let is_free = |heading: &f64| {
+        let way = DVec2::from_angle(*heading);
+        let vehicles = agents.iter().map(|one| &one.agent);
+        let mut vehicles = vehicles.filter(|agent| agent.kind == AgentKind::Vehicle);
+        !vehicles.any(|agent| {
+            let (length, width) = (agent.length, agent.width);
+            let room = DVec2::new(length, width) / 2.0 + WALKING_ROOM_M;
+            let pose = agent.state.pose.inverse();
+            STEPS_ASIDE_M.iter().any(|step| {
+                let local = pose * (at + way * *step);
+                local.abs().cmple(room).all()
+            })
+        })
+    };
+    let sides = [to(side), to(-side)];
+    sides.into_iter().find(is_free).unwrap_or(sides[0])
 }
 
 /// Whether an agent has waited less than another; of those that have waited as long the last one has.
@@ -579,11 +622,12 @@ mod tests {
 
     #[test]
     fn people_walk_on_before_a_vehicle_that_waits_for_them() {
-        let scenario = scenario(
-            "lane 1: 0,0 90,0\nego vehicle 0: 20,0\nagent pedestrian 1: 25,0.5\nagent pedestrian 2: 25,4",
-        );
-        let scene = scenario.present();
-        let gone = |is_late: bool, waited: [f64; 2]| {
+        let gone = |rest: &str, is_late: bool, waited: [f64; 2]| {
+            let scenario = scenario(&format!(
+                "lane 1: 0,0 90,0\nego vehicle 0: 20,0\nagent pedestrian 1: 25,0.5\n\
+                 agent pedestrian 2: 25,5\n{rest}"
+            ));
+            let scene = scenario.present();
             let agents = scene.now().agents().iter();
             let agents: Vec<_> = agents
                 .map(|agent| Standing {
@@ -594,11 +638,18 @@ mod tests {
                     route: None,
                 })
                 .collect();
-            released(scene.map, scene.now().lights(), &agents, is_late).go
+            let released = released(scene.map, scene.now().lights(), &agents, is_late);
+            (released.go, released.aside)
         };
-        assert_eq!(gone(true, [3.0, 3.0]), [1]);
-        assert!(gone(false, [3.0, 3.0]).is_empty());
-        assert!(gone(true, [1.0, 3.0]).is_empty() && gone(true, [3.0, 1.0]).is_empty());
+        assert_eq!(gone("", true, [3.0, 3.0]), (vec![1], vec![]));
+        for (is_late, waited) in [(false, [3.0, 3.0]), (true, [1.0, 3.0]), (true, [3.0, 1.0])] {
+            assert_eq!(gone("", is_late, waited), (vec![], vec![]));
+        }
+        // Later to the side of the vehicle on which it stands, the left one.
+        assert_eq!(gone("", true, [3.0, 7.0]), (vec![1], vec![(1, FRAC_PI_2)]));
+        // Unless another vehicle stands there.
+        let beside = "agent vehicle 3: 26,2.5";
+        assert_eq!(gone(beside, true, [3.0, 7.0]).1, [(1, -FRAC_PI_2)]);
     }
 
     #[test]

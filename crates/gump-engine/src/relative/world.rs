@@ -722,6 +722,12 @@ impl Future {
                     }
                 }
             }
+            let aside = released.aside.into_iter();
+            for (i, heading) in aside.filter(|_| self.scene.has_rules) {
+                let member = &mut self.members[i];
+                member.agent.state.pose.heading = heading;
+                member.seen.turn_to(heading);
+            }
             for i in released.roll {
                 self.members[i].could_go = true;
             }
