@@ -56,7 +56,7 @@ impl Intent {
         driveways: &Driveways,
         now: &Shown,
         seed: Seed,
-        others: impl Iterator<Item = &'a Agent> + Clone,
+        others: &(impl Iterator<Item = &'a Agent> + Clone),
     ) -> bool {
         if let Some(way) = self.turns_in {
             let keeps = TakesWay::of(driveways, way).is_some_and(|way| !way.is_lost(now));

@@ -648,7 +648,7 @@ impl Future {
             let others = agents.iter().chain(&self.others);
             let others = others.filter(|other| other.id != id);
             let (now, stream) = (member.now(), seed.fork(id.0 as u64));
-            if member.intent.turn_in(driveways, &now, stream, others) {
+            if member.intent.turn_in(driveways, &now, stream, &others) {
                 member.seen.head_for(member.intent.route().cloned());
             }
         }
