@@ -101,12 +101,15 @@ pub(super) fn decide<'a>(
     }
     let brakes = now.acceleration().min(0.0);
     let takes = |way: &&WayIn| {
+        // Most are far away.
+        if way.turns_off.distance(now.pose.position) > DECIDES_M {
+            return false;
+        }
         let Some(lane) = driveways.map.lane(way.lane) else {
             return false;
         };
         let line = &lane.centerline;
-        let off = line.point_at(way.turns_off_m);
-        if off.distance(now.pose.position) > DECIDES_M || !is_on(lane, now, ON_WAY) {
+        if !is_on(lane, now, ON_WAY) {
             return false;
         }
         let left = way.turns_off_m - line.project(now.pose.position).arc_length;

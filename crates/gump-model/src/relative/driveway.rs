@@ -44,6 +44,8 @@ pub struct WayIn {
     pub lane: LaneId,
     /// Distance along it at which it leaves the street, metres.
     pub turns_off_m: f64,
+    /// The place there.
+    pub turns_off: DVec2,
 }
 
 /// The ways into the driveways of a map.
@@ -75,6 +77,7 @@ impl Driveways {
                 ways.push(WayIn {
                     lane: lane.id,
                     turns_off_m,
+                    turns_off: lane.centerline.point_at(turns_off_m),
                 });
                 lanes.push(lane);
             }
