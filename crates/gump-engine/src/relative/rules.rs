@@ -278,13 +278,10 @@ impl<'l> Shut<'l> {
             Some(StopLine::at_end(lane))
         };
         let ways = |i: usize| match agents[i].body.kind {
-            AgentKind::Vehicle if known[i].turns_in.is_some() => {
-                let way = known[i].turns_in.into_iter();
-                way.map(|way| course_in(way, colours, &agents[i])).collect()
-            }
-            AgentKind::Vehicle | AgentKind::Bicycle if comes(i) => {
-                courses(map, colours, &agents[i], known[i].route)
-            }
+            AgentKind::Vehicle | AgentKind::Bicycle if comes(i) => match known[i].turns_in {
+                Some(way) => vec![course_in(way, colours, &agents[i])],
+                None => courses(map, colours, &agents[i], known[i].route),
+            },
             _ => Vec::new(),
         };
         let ways: Vec<Vec<Course>> = (0..agents.len()).map(ways).collect();
