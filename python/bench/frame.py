@@ -1,11 +1,14 @@
 """Times frames of a simulation in PyTorch: cached keys and values, then the decoder step by step.
 
     python frame.py FILE --agents N --futures N --frames N --history N --precision f32|bf16 --threads N
+        --passes N
 
 FILE is what `cargo xtask bench engine --torch` writes: weights and shapes. Tokens are random. A
 frame has two tokens per agent and three more; every step takes in the last frame in its final form
 and the next one in its provisional form, decodes the agents of the latter, and keeps the keys and
-values of the former. The raster is encoded before. Prints one line of JSON, as train_step.py, with
+values of the former. With `--passes 1` or `2` nothing is kept: every step reads the whole history again with
+the provisional frame, once as release 1.1 of the authors' model does, twice as release 1.0. The
+raster is encoded before. Prints one line of JSON, as train_step.py, with
 `operations`, PyTorch's count of the floating-point operations of all frames.
 """
 
@@ -55,12 +58,17 @@ class Simulation:
             batch["local_context"] = torch.randn(len(keys), n_numbers)
         return batch, t
 
-    def frame(self, batch, t, pasts):
-        """One frame; the keys and values of all tokens but those of the provisional frame."""
+    def read(self, batch, t, pasts):
+        """The hidden vectors of all tokens, and their keys and values."""
         net = self.net
         net.shape.update(sequences=self.futures, tokens=t)
         x = net.embed(batch, self.visual)
         hidden, _, kept = net.layers(x, self.memories, pasts)
+        return hidden, kept
+
+    def frame(self, batch, t, pasts):
+        """One frame; the keys and values of all tokens but those of the provisional frame."""
+        hidden, kept = self.read(batch, t, pasts)
         hidden = hidden[:, -2 * self.agents :: 2].reshape(-1, hidden.shape[-1])
         self.decode(hidden)
         return [tuple(part[:, :, : -self.slots] for part in pair) for pair in kept]
@@ -84,9 +92,15 @@ class Simulation:
             drawn = torch.multinomial(torch.softmax(logits.float(), dim=-1), 1).squeeze(1)
             drawn = drawn + begin + net.shape["field_row"]
 
-    def run(self, frames):
+    def run(self, frames, passes):
+        """Some frames with a cache, or in so many passes without one."""
         pasts = None
         for i in range(frames):
+            if passes:
+                for _ in range(passes - 1):
+                    self.read(*self.drawn[0], None)
+                self.frame(*self.drawn[0], None)
+                continue
             batch, t = self.drawn[0 if i == 0 else 1]
             pasts = self.frame(batch, t, pasts)
 
@@ -100,6 +114,7 @@ def main():
     parser.add_argument("--history", type=int, default=3)
     parser.add_argument("--precision", choices=["f32", "bf16"], default="f32")
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--passes", type=int, default=0, choices=[0, 1, 2])
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
     torch.manual_seed(0)
@@ -113,9 +128,9 @@ def main():
         # The first step reads the history, later ones the last frame.
         simulation.drawn = [simulation.tokens(arguments.history + 1), simulation.tokens(2)]
         with FlopCounterMode(display=False) as counter:
-            simulation.run(arguments.frames)
+            simulation.run(arguments.frames, arguments.passes)
         began, cpu_began = time.perf_counter(), time.process_time()
-        simulation.run(arguments.frames)
+        simulation.run(arguments.frames, arguments.passes)
         seconds, cpu_seconds = time.perf_counter() - began, time.process_time() - cpu_began
     print(
         json.dumps(

@@ -240,7 +240,7 @@ impl Args {
                 worlds.push(self.world_in(run, size, growing, precision)?);
             }
             let mut ours = [const { Vec::new() }; 3];
-            let mut theirs = [const { Vec::new() }; 2];
+            let mut theirs = [const { Vec::new() }; TORCH_WAYS.len()];
             let mut operations = [0.0; 2];
             for _ in 0..ROUNDS {
                 for (world, costs) in worlds.iter().zip(&mut ours) {
@@ -248,22 +248,24 @@ impl Args {
                     costs.push(cost.cpu / cost.frames as f64);
                     operations[0] = cost.operations as f64 / cost.frames as f64;
                 }
-                for (precision, costs) in ["f32", "bf16"].into_iter().zip(&mut theirs) {
+                for (i, (way, costs)) in TORCH_WAYS.iter().zip(&mut theirs).enumerate() {
                     let timed = self.frames_in_torch(
                         torch,
                         &file,
-                        precision,
+                        way,
                         (scenario, n_futures, steps),
                         run.threads(),
                     )?;
                     let frames = (steps * n_futures) as f64;
                     costs.push(timed.cpu_seconds / frames);
-                    operations[1] = timed.operations / frames;
+                    if i == 0 {
+                        operations[1] = timed.operations / frames;
+                    }
                 }
             }
             let middle = |all| super::median(all).unwrap_or(f64::NAN);
             let [f32, bf16, int8] = ours.map(middle);
-            let [torch_f32, torch_bf16] = theirs.map(middle);
+            let [torch_f32, torch_bf16, torch_1_pass, torch_2_passes] = theirs.map(middle);
             rows.push(json!({
                 "size": size,
                 "agents": scenario.present().now().agents().len(),
@@ -276,6 +278,8 @@ impl Args {
                 "int8_cpu_ms": 1e3 * int8,
                 "torch_f32_cpu_ms": 1e3 * torch_f32,
                 "torch_bf16_cpu_ms": 1e3 * torch_bf16,
+                "torch_1_pass_cpu_ms": 1e3 * torch_1_pass,
+                "torch_2_passes_cpu_ms": 1e3 * torch_2_passes,
                 "gflop_per_frame": operations[0] / 1e9,
                 "torch_gflop_per_frame": operations[1] / 1e9,
             }));
@@ -288,7 +292,7 @@ impl Args {
         &self,
         torch: &Torch,
         file: &Path,
-        precision: &str,
+        (precision, passes): &(&str, &str),
         (scenario, n_futures, steps): (&Scenario, usize, usize),
         threads: usize,
     ) -> anyhow::Result<Timed> {
@@ -308,6 +312,8 @@ impl Args {
             &history,
             "--precision",
             precision,
+            "--passes",
+            passes,
         ];
         torch.time("frame.py", threads, &arguments)
     }
@@ -401,6 +407,9 @@ fn measure(
 /// Measurements of each implementation, alternating; the median is reported. The fewest that have
 /// one.
 const ROUNDS: usize = 3;
+/// The ways of a frame in PyTorch, as `--precision` and `--passes` of `frame.py`: with a cache, and
+/// without one as in releases 1.1 and 1.0 of the authors' model.
+const TORCH_WAYS: [(&str, &str); 4] = [("f32", "0"), ("bf16", "0"), ("f32", "1"), ("f32", "2")];
 
 /// Products per measurement: half a second of work, for a clock of hundredths.
 const REPEATS: usize = 24;
