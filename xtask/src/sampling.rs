@@ -35,7 +35,7 @@ pub(crate) struct Draw {
     #[arg(long, value_name = "N")]
     top_k: Option<usize>,
     /// Nucleus sampling: only the likeliest bins that together have this probability [default: 1,
-    /// and 0.95 of a relative network]
+    /// and 0.95 of a relative network, which cuts less off sideways moves and turns]
     #[arg(long, value_name = "X")]
     top_p: Option<f64>,
     /// Weight decay^age of earlier predictions of a moment, 0 for none [default: 0.3]

@@ -105,8 +105,8 @@ const STAYS: f64 = 0.8;
 /// city traffic.
 const FOLLOW_M: f64 = 180.0;
 
-/// Default nucleus: draws are among the most likely bins that together have this probability.
-/// Targets are smoothed over neighbouring bins, so the truncated part is mostly smoothing: with 1,
+/// Default nucleus of the distance ahead: draws are among the most likely bins that together have this
+/// probability. Targets are smoothed over neighbouring bins, so the truncated part is mostly smoothing: with 1,
 /// pedestrians occasionally jump. Chosen on the tuning set (result 19).
 const TOP_P: f64 = 0.95;
 
@@ -133,8 +133,9 @@ const ROUTES: u64 = 1 << 42;
 pub struct RelativeSampling {
     /// Divides the logits; above 1 gives more varied draws.
     pub temperature: f64,
-    /// Nucleus: draws are among the most likely bins that together have this probability; whether
-    /// to stand is drawn from both.
+    /// Nucleus of the distance ahead: draws are among the most likely bins that together have this
+    /// probability. Of sideways moves and turns 0.4 of that tail is cut off; whether to stand is drawn
+    /// from both.
     pub top_p: f64,
     /// Maximum number of redraws of an agent that would overlap another or leave the road within
     /// 1.5 s.

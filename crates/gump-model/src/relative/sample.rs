@@ -186,6 +186,8 @@ pub struct State {
     pub shown: Pose,
     /// Logged velocity, world frame, metres per second.
     pub velocity: DVec2,
+    /// Weight of the move to here in the loss.
+    weight: f32,
     off: Off,
 }
 
@@ -201,15 +203,18 @@ impl State {
             logged: pose,
             shown: pose,
             velocity,
+            weight: 1.0,
             off: Off::default(),
         }
     }
 
-    /// The same, for an agent that was led away from the log.
-    pub fn led_to(self, pose: Pose) -> Self {
+    /// The same, for an agent that was led away from the log; its move to here has this weight in the
+    /// loss.
+    pub fn led_to(self, pose: Pose, weight: f32) -> Self {
         Self {
             logged: pose,
             shown: pose,
+            weight,
             off: Off::default(),
             ..self
         }
@@ -430,6 +435,7 @@ fn track(
             logged: pose,
             shown: pushed(pose, off),
             velocity: agent.state.velocity,
+            weight: 1.0,
             off,
         })
     });
@@ -569,7 +575,8 @@ fn assemble(
             }
             graph.offsets.push(graph.sources.len() as u32);
             let learns = !tracks[a].is_obstacle;
-            if let Some(target) = target(tracks, a, t, own).filter(|_| learns) {
+            let target = target(tracks, a, t, own).filter(|target| learns && target.weight > 0.0);
+            if let Some(target) = target {
                 let node = node_of[t][a].expect("the agent is present");
                 sample.targets.push(Target { node, ..target });
             }
@@ -608,7 +615,7 @@ fn target(tracks: &[Track], a: usize, t: usize, own: &Shown) -> Option<Target> {
         agent: a as u32,
         frame: t as u32,
         bins: quantize(step),
-        weight: if own.tracked { 1.0 } else { UNTRACKED },
+        weight: next.weight * if own.tracked { 1.0 } else { UNTRACKED },
     })
 }
 

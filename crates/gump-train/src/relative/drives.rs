@@ -102,6 +102,10 @@ pub struct RelativeDrives {
     /// probability. Targets are smoothed, and without truncation draws would spread a little more
     /// with each update.
     pub top_p: f64,
+    /// Weight in those samples of moves that were neither redrawn nor given by the log. They are the
+    /// network's own: it learns from them to do what it does, without the tail that was cut off, so
+    /// that people turn and vehicles change lane less with every update.
+    pub unchanged: f32,
     /// Agents that are added to those samples.
     pub crowd: Crowd,
 }
@@ -119,6 +123,7 @@ impl Default for RelativeDrives {
             ruled: 0.0,
             redraws: 8,
             top_p: 0.95,
+            unchanged: 1.0,
             crowd: Crowd::default(),
         }
     }
@@ -139,6 +144,10 @@ impl RelativeDrives {
             if !(0.0..=1.0).contains(&share) {
                 return fail(key, &format!("{name} must be between 0 and 1"));
             }
+        }
+        if !(0.0..=1.0).contains(&self.unchanged) {
+            let what = "unchanged must be between 0 and 1";
+            return fail("closed_loop.unchanged", what);
         }
         if !(self.top_p > 0.0 && self.top_p <= 1.0) {
             return fail("closed_loop.top_p", "top_p must be above 0 and at most 1");
@@ -313,9 +322,13 @@ impl TrackDriver for NetworkDriver {
                 };
                 let ground = (lane_map, &fault as &Fault<'_>);
                 let moves = self.moves_by_the_rules(crowd, ground, &hidden, seed, &mut room);
-                for ((&a, now), step) in here.iter().zip(&agents).zip(moves) {
+                for ((&a, now), (step, is_unchanged)) in here.iter().zip(&agents).zip(moves) {
                     if let Some(next) = tracks[a].states[t + 1].as_mut().filter(|_| !stays[a]) {
-                        *next = next.led_to(now.pose * step);
+                        let weight = match is_unchanged {
+                            true => self.config.unchanged,
+                            false => 1.0,
+                        };
+                        *next = next.led_to(now.pose * step, weight);
                     }
                 }
                 continue;
@@ -342,7 +355,7 @@ impl TrackDriver for NetworkDriver {
 
 impl NetworkDriver {
     /// A move of every agent in its own frame, redrawn where it has a fault and where the rules
-    /// forbid it; some are given.
+    /// forbid it; some are given. With each, whether it is the network's first draw.
     fn moves_by_the_rules(
         &self,
         (agents, given): (&[Shown], &[Option<Pose>]),
@@ -350,7 +363,7 @@ impl NetworkDriver {
         hidden: &[f32],
         seed: Seed,
         room: &mut Workspace,
-    ) -> Vec<Pose> {
+    ) -> Vec<(Pose, bool)> {
         let draw = Draw {
             temperature: self.config.temperature,
             top_p: self.config.top_p,
@@ -372,6 +385,7 @@ impl NetworkDriver {
         };
         let all: Vec<usize> = (0..agents.len()).collect();
         let mut moves = drawn(&all, 0);
+        let first = moves.clone();
         let faults = all.iter().map(|&i| (i, fault(i, &moves[i])));
         let mut faulty: Vec<(usize, f64)> = faults.filter(|(_, fault)| *fault > 0.0).collect();
         for attempt in 0..FAULT_REDRAWS {
@@ -394,7 +408,9 @@ impl NetworkDriver {
             &mut moves,
             &mut again,
         );
-        moves
+        let all = moves.into_iter().zip(&first).zip(given);
+        all.map(|((step, first), given)| (step, given.is_none() && step == *first))
+            .collect()
     }
 
     /// The candidates' moves of all agents, in the agents' frames.

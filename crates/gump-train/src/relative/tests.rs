@@ -295,6 +295,47 @@ fn agents_that_go_their_own_ways_learn_what_they_did() {
     assert_eq!(drawn(1.0).nodes, ruled.nodes);
 }
 
+/// Of free drives only moves that were redrawn, or given by the log, can be left to learn from.
+#[test]
+fn moves_that_nothing_changed_can_be_left_out() {
+    let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
+    let text = "lane 1: 0,0 300,0\nego vehicle 0: 10,0 velocity 8,0\nagent vehicle 1: 60,4";
+    let scenario = fixture::scenario(text).unwrap();
+    let drawn = |unchanged, ruled, seed| {
+        let config = RelativeDrives {
+            share: 1.0,
+            ruled,
+            unchanged,
+            ..RelativeDrives::default()
+        };
+        let driver = drives::NetworkDriver::new(&network, &config).unwrap();
+        draw(&scenario, &SampleConfig::plain(), Some(&driver), Seed(seed)).unwrap()
+    };
+    let bins = |sample: &sample::Sample| -> Vec<_> {
+        let targets = sample.targets.iter();
+        targets
+            .map(|t| (t.node, t.bins, t.weight.to_bits()))
+            .collect()
+    };
+    let mut n_left_out = 0;
+    for seed in 0..8 {
+        let (all, changed) = (drawn(1.0, 1.0, seed), drawn(0.0, 1.0, seed));
+        assert_eq!(all.nodes, changed.nodes, "they drive alike");
+        let (all, changed) = (bins(&all), bins(&changed));
+        assert!(changed.iter().all(|target| all.contains(target)));
+        // The parked vehicle's standing is of the log.
+        let parked = |targets: &[(u32, [u16; grid::FIELDS], u32)]| {
+            let stands = targets.iter().filter(|t| t.1[0] == grid::STANDS);
+            stands.count()
+        };
+        assert!(parked(&changed) > 0);
+        n_left_out += all.len() - changed.len();
+        let led_back = [1.0, 0.0].map(|unchanged| bins(&drawn(unchanged, 0.0, seed)));
+        assert_eq!(led_back[0], led_back[1], "returns to the log count in full");
+    }
+    assert!(n_left_out > 0);
+}
+
 /// A random network that drives under the rules.
 fn under_the_rules() -> drives::NetworkDriver {
     let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
