@@ -6,10 +6,10 @@
 FILE is what `cargo xtask bench engine --torch` writes: weights and shapes. Tokens are random. A
 frame has two tokens per agent and three more; every step takes in the last frame in its final form
 and the next one in its provisional form, decodes the agents of the latter, and keeps the keys and
-values of the former. With `--passes 1` or `2` nothing is kept: every step reads the whole history again with
-the provisional frame, once as release 1.1 of the authors' model does, twice as release 1.0. The
-raster is encoded before. Prints one line of JSON, as train_step.py, with
-`operations`, PyTorch's count of the floating-point operations of all frames.
+values of the former. With `--passes 1` or `2` nothing is kept: every step reads the whole history
+again with the provisional frame, once as release 1.1 of the authors' model does, twice as release
+1.0. The raster is encoded before. Prints one line of JSON, as train_step.py, with `operations`,
+PyTorch's count of the floating-point operations of all frames.
 """
 
 import argparse

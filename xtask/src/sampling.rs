@@ -44,7 +44,8 @@ pub(crate) struct Draw {
     /// Resample colliding or off-road samples up to N times, 0 for never [default: 12]
     #[arg(long, value_name = "N")]
     redraws: Option<usize>,
-    /// No kinematic limits: vehicles and bicycles may turn on the spot, slip sideways and stop at once
+    /// No kinematic limits: vehicles and bicycles may turn on the spot, slip sideways and stop at
+    /// once, and people may be faster than a runner
     #[arg(long)]
     no_limits: bool,
     /// When the vehicles of a relative network are given routes, which they keep

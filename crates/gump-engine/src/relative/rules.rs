@@ -48,7 +48,7 @@ const GRIP_MPS2: f64 = 8.0;
 /// A vehicle's rear axle is this far behind its centre, metres, ...
 const AXLE_M: f64 = 1.4;
 /// ... and slides at most this far in a step, metres, and metres per metre ahead: recorded vehicles slide
-/// at more than 0.5 m/s in less than 0.1 % of the time (result 42). Slower ones slide farther in SUMO,
+/// at more than 0.5 m/s in less than 0.1 % of the time (results 18 and 42). Slower ones slide farther in SUMO,
 /// which turns vehicles about their fronts (result 39).
 const SLIDES_M: (f64, f64) = (0.08, 0.015);
 const SLIDES_SLOW_M: (f64, f64) = (0.75, 0.1);

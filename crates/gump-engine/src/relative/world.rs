@@ -105,9 +105,9 @@ const STAYS: f64 = 0.8;
 /// city traffic.
 const FOLLOW_M: f64 = 180.0;
 
-/// Default nucleus of the distance ahead: draws are among the most likely bins that together have this
-/// probability. Targets are smoothed over neighbouring bins, so the truncated part is mostly smoothing: with 1,
-/// pedestrians occasionally jump. Chosen on the tuning set (result 19).
+/// Default nucleus of the distance ahead: draws are among the most likely bins that together have
+/// this probability. Targets are smoothed over neighbouring bins, so the truncated part is mostly
+/// smoothing: with 1, pedestrians occasionally jump. Chosen on the tuning set (result 19).
 const TOP_P: f64 = 0.95;
 
 /// Maximum number of futures that are computed together: with more, the weights are already loaded
@@ -143,7 +143,8 @@ pub struct RelativeSampling {
     /// Whether redraws also keep agents clear of an ego that is driven from outside. Without it only
     /// the network makes them react to it.
     pub yields_to_driven: bool,
-    /// Whether vehicles and bicycles are prevented from turning in place and slipping sideways.
+    /// Whether vehicles and bicycles are prevented from turning in place and slipping sideways, and
+    /// people from speeding up beyond a run.
     pub limits: bool,
     /// When vehicles are given routes, which they keep.
     pub routes: Routes,

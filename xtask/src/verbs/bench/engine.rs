@@ -57,7 +57,8 @@ pub(crate) struct Args {
     /// Frames per measurement of partial autoregression, half a second each
     #[arg(long, value_name = "N", default_value_t = 16)]
     frames: usize,
-    /// Python with PyTorch, whose frames with cached keys and values are timed in the same run
+    /// Python with PyTorch, whose frames with and without cached keys and values are timed in the
+    /// same run
     #[arg(long, value_name = "PYTHON")]
     torch: Option<PathBuf>,
     /// Only `tiny`, only a few frames, full autoregression only of one future
