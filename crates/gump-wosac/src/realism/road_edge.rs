@@ -37,10 +37,48 @@ pub(crate) struct RoadEdges {
 enum Lookup {
     /// Since 2024: the nearest segment in space, height stretched.
     Space { blocks: Blocks, stretch: f32 },
-    /// 2023: the nearest segment of each edge on the ground (first segment, its boxes), of these
-    /// the smallest distance.
-    Ground(Vec<(usize, Blocks)>),
+    /// 2023: the nearest segment of each edge on the ground, of these the smallest distance.
+    Ground(Vec<Part>),
 }
+
+/// One edge of 2023.
+#[derive(Clone, Debug)]
+struct Part {
+    /// Index of its first segment.
+    first: usize,
+    blocks: Blocks,
+    /// Segments on whose straight extension, far from the edge, its distance is 0.
+    rays: Vec<usize>,
+    /// A segment without length has distance 0 wherever it is the nearest.
+    is_zero_anywhere: bool,
+}
+
+/// What a query found, for the next one with a point near by.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Hints {
+    /// The nearest segment: of all edges, in 2023 of each.
+    segments: Vec<usize>,
+    near: Option<Near>,
+}
+
+/// The edges and rays of 2023 that matter within [`NEAR`] of a place.
+#[derive(Clone, Debug)]
+struct Near {
+    at: [f32; 2],
+    parts: Vec<usize>,
+    rays: Vec<usize>,
+}
+
+/// How far a point may move before edges are looked for again, metres: 6 is the fastest of 2, 3, 4, 6
+/// and 8 for recorded scenes.
+const NEAR: f32 = 6.0;
+/// Larger than rounding errors of distances, metres.
+const MARGIN: f32 = 0.05;
+/// Cosine of the change of direction from which on a joint can be the nearest place of an edge to
+/// a point on the extension of one of its segments; 0 without rounding.
+const SHARP_TURN: f32 = 0.5;
+/// A segment shorter than this hardly tells its joints apart, metres.
+const SHORT: f32 = 0.05;
 
 impl RoadEdges {
     /// Edges of fewer than two points do not count.
@@ -59,8 +97,14 @@ impl RoadEdges {
         for edge in edges.iter().filter(|edge| edge.len() >= 2) {
             let first = segments.len();
             push(&mut segments, edge, is_ring(edge));
+            let own = first..segments.len();
             let bounds: Vec<_> = segments[first..].iter().map(|s| bounds(s, 0.0)).collect();
-            parts.push((first, Blocks::new(&bounds)));
+            parts.push(Part {
+                first,
+                blocks: Blocks::new(&bounds),
+                rays: own.filter(|&i| has_ray(&segments, i)).collect(),
+                is_zero_anywhere: segments[first..].iter().any(|s| s.length() == 0.0),
+            });
         }
         Self {
             segments,
@@ -88,40 +132,86 @@ impl RoadEdges {
         }
     }
 
-    /// Signed distance on the ground; `hints` are the results of the last queries.
-    pub(crate) fn signed_distance(&self, point: [f32; 3], hints: &mut Vec<usize>) -> f32 {
+    /// Signed distance on the ground; `hints` are the results of the last query.
+    pub(crate) fn signed_distance(&self, point: [f32; 3], hints: &mut Hints) -> f32 {
         match &self.lookup {
             Lookup::Space { blocks, stretch } => {
-                hints.resize(1, 0);
+                hints.segments.resize(1, 0);
                 let query = [point[0], point[1], point[2] * stretch];
                 let cost = |i: usize| self.segments[i].offset(point).in_space(*stretch);
-                let Some((i, _)) = blocks.nearest(query, hints[0], cost) else {
+                let Some((i, _)) = blocks.nearest(query, hints.segments[0], cost) else {
                     return FAR;
                 };
-                hints[0] = i;
+                hints.segments[0] = i;
                 let offset = self.segments[i].offset(point);
                 self.sign(i, point, offset.t, offset.t > 1.0) * offset.on_ground()
             }
             Lookup::Ground(parts) => {
-                hints.resize(parts.len(), 0);
-                let point = [point[0], point[1], 0.0];
-                let mut nearest = FAR;
-                for ((first, blocks), hint) in parts.iter().zip(hints) {
-                    let cost = |i: usize| self.segments[first + i].offset(point).on_ground();
-                    let Some((i, distance)) = blocks.nearest(point, *hint, cost) else {
-                        continue;
-                    };
-                    *hint = i;
-                    let t = self.segments[first + i].offset(point).t;
-                    // The sign is 0 on the line itself, and 0 then wins over every other edge.
-                    let value = self.sign(first + i, point, t, t >= 1.0) * distance;
-                    if value.abs() < nearest.abs() {
-                        nearest = value;
-                    }
-                }
-                nearest
+                hints.segments.resize(parts.len(), 0);
+                self.on_ground_near([point[0], point[1], 0.0], parts, hints)
             }
         }
+    }
+
+    /// The distance of 2023. The sign is 0 on the line itself, and 0 then wins over every other
+    /// edge. Far edges can only matter by that, on one of their rays.
+    fn on_ground_near(&self, point: [f32; 3], parts: &[Part], hints: &mut Hints) -> f32 {
+        let is_near = |near: &Near| {
+            let [x, y] = [point[0] - near.at[0], point[1] - near.at[1]];
+            x * x + y * y < NEAR * NEAR
+        };
+        let is_on_ray = |near: &Near| {
+            let mut rays = near.rays.iter();
+            rays.any(|&i| self.segments[i].side(point) == 0.0)
+        };
+        let known = hints.near.as_ref().filter(|near| is_near(near));
+        if let Some(near) = known.filter(|near| !is_on_ray(near)) {
+            let parts = near.parts.iter().map(|&k| (k, &parts[k]));
+            return self.smallest(point, parts, &mut hints.segments, |_, _| {});
+        }
+        let mut distances = vec![FAR; parts.len()];
+        let all = parts.iter().enumerate();
+        let found = self.smallest(point, all, &mut hints.segments, |k, distance| {
+            distances[k] = distance;
+        });
+        let least = distances.iter().copied().fold(FAR, f32::min);
+        let matters = |k: usize| {
+            parts[k].is_zero_anywhere || distances[k] < least + 2.0 * NEAR + 2.0 * MARGIN
+        };
+        let rays = parts.iter().flat_map(|part| &part.rays).copied();
+        hints.near = Some(Near {
+            at: [point[0], point[1]],
+            parts: (0..parts.len()).filter(|&k| matters(k)).collect(),
+            rays: rays
+                .filter(|&i| self.segments[i].distance_from_line(point) < NEAR + MARGIN)
+                .collect(),
+        });
+        found
+    }
+
+    /// The smallest of the signed distances from some edges; tells of each its index and distance.
+    fn smallest<'a>(
+        &self,
+        point: [f32; 3],
+        parts: impl Iterator<Item = (usize, &'a Part)>,
+        hints: &mut [usize],
+        mut tell: impl FnMut(usize, f32),
+    ) -> f32 {
+        let mut nearest = FAR;
+        for (k, Part { first, blocks, .. }) in parts {
+            let cost = |i: usize| self.segments[first + i].offset(point).on_ground();
+            let Some((i, distance)) = blocks.nearest(point, hints[k], cost) else {
+                continue;
+            };
+            hints[k] = i;
+            tell(k, distance);
+            let t = self.segments[first + i].offset(point).t;
+            let value = self.sign(first + i, point, t, t >= 1.0) * distance;
+            if value.abs() < nearest.abs() {
+                nearest = value;
+            }
+        }
+        nearest
     }
 
     /// On which side of the edge the point is: 1 right, -1 left, 0 on it; `t` is its position along
@@ -189,6 +279,17 @@ impl Segment {
         }
     }
 
+    /// Length on the ground.
+    fn length(&self) -> f32 {
+        self.along[0].hypot(self.along[1])
+    }
+
+    /// Distance from the straight line through the segment.
+    fn distance_from_line(&self, point: [f32; 3]) -> f32 {
+        let v = self.relative(point);
+        (v[0] * self.along[1] - v[1] * self.along[0]).abs() / self.length()
+    }
+
     fn side(&self, point: [f32; 3]) -> f32 {
         let v = self.relative(point);
         sign(v[0] * self.along[1] - v[1] * self.along[0])
@@ -204,6 +305,21 @@ fn bounds(segment: &Segment, stretch: f32) -> Bounds {
     let [dx, dy, dz] = segment.along;
     let (from, to) = (z * stretch, (z + dz) * stretch);
     Bounds::of([x, y, from], [x + dx, y + dy, to])
+}
+
+/// Whether a point far from the edge can be on the extension of segment `i` and have this segment
+/// or its neighbour as the nearest of the edge: at an open end, at a sharp turn, and, up to
+/// rounding, beside a very short segment. Segments without length are treated apart.
+fn has_ray(segments: &[Segment], i: usize) -> bool {
+    if segments[i].length() == 0.0 {
+        return false;
+    }
+    let turns = |j: usize| {
+        let (a, b) = (segments[i].along, segments[j].along);
+        let (long, short) = (segments[i].length(), segments[j].length());
+        j == i || long.min(short) < SHORT || a[0] * b[0] + a[1] * b[1] < SHARP_TURN * long * short
+    };
+    turns(segments[i].previous) || turns(segments[i].next)
 }
 
 fn is_ring(edge: &[[f32; 3]]) -> bool {
@@ -250,7 +366,7 @@ pub(crate) fn outermost(
     edges: &RoadEdges,
 ) -> Vec<f32> {
     // Each corner has its own hints: it moves little from step to step.
-    let mut hints: [Vec<usize>; 4] = Default::default();
+    let mut hints: [Hints; 4] = Default::default();
     let states = &simulated.states(agent)[first..];
     let outermost = |state: &State| {
         if !state.valid {
