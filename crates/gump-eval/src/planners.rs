@@ -20,7 +20,7 @@ use gump_planner::{
     Aggregate, Allocation, Explain, ImitationDriver, InteractiveDriver, InteractiveDriverConfig,
     LogDriver, NuplanIdmDriver, PdmClosed, PlanBudget, SimpleDriver, ValueEstimate, WarmStart,
 };
-use gump_rollout::worlds::Idm;
+use gump_rollout::worlds::{ConstantVelocity, Idm};
 use gump_rollout::{BoxError, WorldModel};
 use gump_scene::Seed;
 use serde::{Serialize, Serializer};
@@ -258,6 +258,9 @@ pub(crate) fn catch_panics<T>(
     })
 }
 
+/// Part of the seed of traffic.
+const TRAFFIC: u64 = 0x7261_6666;
+
 /// The traffic of a drive and the world that planners roll out, by the world's name.
 pub struct PlanningWorld {
     name: WorldName,
@@ -303,24 +306,24 @@ impl PlanningWorld {
         Self::load(device, name, &growing)
     }
 
-    /// The world that planners roll out: the network where there is one, else reactive rules.
+    /// The world that planners roll out. Instead of the log, which knows the future, reactive rules.
     pub fn imagination(&self) -> &dyn WorldModel {
-        match &self.learned {
-            Some(world) => world.model(),
-            None => &self.rules,
+        match (&self.name, &self.learned) {
+            (_, Some(world)) => world.model(),
+            (WorldName::ConstantVelocity, None) => &ConstantVelocity,
+            _ => &self.rules,
         }
     }
 
-    /// The traffic of one drive.
+    /// The traffic of one drive. Its draws are not those of a planner with the same seed, whose
+    /// imagination would otherwise foresee them.
     pub fn traffic(&self, seed: Seed) -> Box<dyn Traffic + '_> {
+        let seed = seed.fork(TRAFFIC);
         match (&self.name, &self.learned) {
             (WorldName::Log, _) => Box::new(Replayed),
             (WorldName::Idm, _) => Box::new(NuplanIdm::default()),
             (_, Some(world)) => Box::new(ImaginedTraffic::new(world.model(), seed)),
-            (_, None) => Box::new(ImaginedTraffic::new(
-                &gump_rollout::worlds::ConstantVelocity,
-                seed,
-            )),
+            (_, None) => Box::new(ImaginedTraffic::new(&ConstantVelocity, seed)),
         }
     }
 }

@@ -33,8 +33,8 @@ pub(crate) struct Args {
     /// Planner that drives
     #[arg(long, value_parser = planner(), value_name = "P", default_value_t = PlannerName::Interactive)]
     planner: PlannerName,
-    /// Traffic model of the drive and of the planner's rollouts: log, idm, constant-velocity or
-    /// model:WEIGHTS
+    /// Traffic model of the drive and of the planner's rollouts: log (rollouts: idm), idm,
+    /// constant-velocity or model:WEIGHTS
     #[arg(long, value_name = "W", default_value = "idm")]
     world: WorldName,
     /// Write a page that explains the decision of a step [default: the most decisive one]

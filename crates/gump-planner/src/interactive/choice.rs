@@ -89,6 +89,8 @@ pub(super) struct Reward<'a> {
 #[derive(Clone, Debug)]
 pub(super) struct Judged {
     parts: PdmScore,
+    /// Whatever is driven from this step on is no progress.
+    closes_up_at: Option<usize>,
     /// 1 if never too fast; falls with the mean excess.
     speed_limit: f64,
     /// The total.
@@ -124,9 +126,18 @@ impl Reward<'_> {
                 forecast: &future.forecast,
                 ..self.judge
             };
-            judge.parts(&future.drive, self.is_comfortable(&future.drive))
+            let drive = &future.drive;
+            let mut parts = judge.parts(drive, self.is_comfortable(drive));
+            // Driving up to the bumper of who stands ahead is not worth anything: the last metre
+            // would otherwise be all that candidates in a queue differ in.
+            let closes_up_at = judge.closes_up_at(drive);
+            if let Some(step) = closes_up_at {
+                let counted = judge.place(&drive[step]) - judge.place(&drive[0]);
+                parts.progress_m = parts.progress_m.min(counted.max(0.0));
+            }
+            (parts, closes_up_at)
         });
-        let mut parts: Vec<PdmScore> = judged.collect();
+        let (mut parts, closing): (Vec<PdmScore>, Vec<Option<usize>>) = judged.unzip();
         for future in 0..n_futures {
             let of_future = || (future..futures.len()).step_by(n_futures);
             let mut group: Vec<PdmScore> = of_future().map(|i| parts[i].clone()).collect();
@@ -135,9 +146,11 @@ impl Reward<'_> {
                 .zip(group)
                 .for_each(|(i, score)| parts[i] = score);
         }
-        let all = futures.iter().zip(parts).map(|(future, parts)| {
+        let all = futures.iter().zip(parts).zip(closing);
+        let all = all.map(|((future, parts), closes_up_at)| {
             let mut judged = Judged {
                 parts,
+                closes_up_at,
                 speed_limit: self.speed_limit(&future.drive),
                 total: 0.0,
             };
@@ -192,9 +205,12 @@ fn discount(rows: &mut [(&mut Judged, &[EgoState])], judge: &Judge<'_>, gamma: f
     };
     let places: Vec<Vec<f64>> = rows
         .iter()
-        .map(|(_, drive)| {
-            let states = drive.iter().step_by(DECISION);
-            states.map(|state| judge.place(state)).collect()
+        .map(|(judged, drive)| {
+            let end = judged.closes_up_at.unwrap_or(drive.len());
+            let steps = (0..drive.len()).step_by(DECISION);
+            steps
+                .map(|step| judge.place(&drive[step.min(end)]))
+                .collect()
         })
         .collect();
     let (mut sums, mut weights) = (vec![0.0; rows.len()], 0.0);
@@ -294,7 +310,8 @@ impl Tally {
 
     fn standing(&self, config: &InteractiveDriverConfig) -> Standing {
         let n = self.scores.len() as f64;
-        let steps = self.futures[0].drive.len() - 1;
+        // A short horizon without a collision is no emergency.
+        let never = (self.futures[0].drive.len() - 1).max(2 * BRAKE_STEPS);
         let mean = |part: &dyn Fn(&PdmScore) -> f64| {
             let parts = self.scores.iter().map(|judged| part(&judged.parts));
             parts.sum::<f64>() / n
@@ -322,7 +339,7 @@ impl Tally {
             value,
             collisions: collided.count(),
             progress_m: mean(&|score| score.progress_m),
-            collision_s: mean(&|score| score.collision_step.unwrap_or(steps) as f64 * DT),
+            collision_s: mean(&|score| score.collision_step.unwrap_or(never) as f64 * DT),
         }
     }
 

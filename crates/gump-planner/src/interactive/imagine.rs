@@ -327,11 +327,22 @@ impl<'a> Imagination<'a> {
             }
             let answered = (self.clock)();
             phases.frames += answered - driven;
-            let present = round.scene.now();
+            let (present, judge) = (round.scene.now(), self.judge_of());
             futures
                 .par_iter_mut()
                 .filter(|future| future.frames.len() == decision)
                 .for_each(|future| future.remember(present));
+            // Not before the others' answer: they may have braked.
+            futures[..n_ruled]
+                .par_iter_mut()
+                .filter(|future| future.frames.len() == decision)
+                .for_each(|future| {
+                    let judge = Judge {
+                        forecast: &future.forecast,
+                        ..judge
+                    };
+                    future.lost = judge.is_lost(&future.drive);
+                });
             phases.policies += (self.clock)() - answered;
             imagined = decision;
         }
@@ -407,7 +418,6 @@ impl<'a> Imagination<'a> {
         futures: &mut [CandidateFuture],
     ) {
         let wheel_base = self.state.vehicle.wheel_base;
-        let judge = self.judge_of();
         let room = || (Tracker::new(LOOK), Vec::new());
         futures
             .par_iter_mut()
@@ -435,11 +445,6 @@ impl<'a> Imagination<'a> {
                     future.drive.extend_from_slice(&states[1..=DECISION]);
                     future.policy.truncate(k + DECISION);
                 }
-                let judge = Judge {
-                    forecast: &future.forecast,
-                    ..judge
-                };
-                future.lost = judge.is_lost(&future.drive);
             });
     }
 

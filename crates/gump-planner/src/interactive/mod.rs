@@ -314,6 +314,9 @@ pub struct Decision {
 /// the simulated agents and drives on, and the world reacts within the same frame. A plan is thus
 /// not a fixed line, and the motion of other agents is not a fixed forecast.
 ///
+/// Whatever a candidate drives within a metre behind something that stands, until the end of its
+/// future, is no progress.
+///
 /// A future in which a gate of the score has closed for good can gain no further value, so the
 /// rest of it is not simulated. This bound is exact.
 ///

@@ -915,6 +915,40 @@ impl Session for WrongSession {
 }
 
 #[test]
+fn nothing_is_gained_by_creeping_up_to_who_stands() {
+    // The world's ego rolls on at 1 m/s, 4 m in all.
+    let world = ByLaw(|agent, _, _| coasted(agent));
+    let config = InteractiveDriverConfig {
+        imitation: true,
+        ..only(&[0.2], &[0.0])
+    };
+    let imitation = |text: &str, value: ValueEstimate| {
+        let config = InteractiveDriverConfig {
+            value,
+            ..config.clone()
+        };
+        let text = format!("ego vehicle 0: 2,0 velocity 1,0 size 4.8,2\n{text}");
+        decide(&world, config, &text).candidates[1].clone()
+    };
+    let returns = [
+        ValueEstimate::Rollout,
+        ValueEstimate::DiscountedStep { gamma: 1.0 },
+    ];
+    for value in returns {
+        let free = imitation("", value);
+        assert_abs_diff_eq!(free.progress_m, 4.0, epsilon = 0.1);
+        // 4.5 m before who stands: 3.5 m count. As much beside it, or before who drives, all does.
+        let behind = imitation("agent vehicle 1: 11.3,0 size 4.8,2", value);
+        assert_eq!(behind.collisions, 0);
+        assert_abs_diff_eq!(behind.progress_m, 3.5, epsilon = 0.2);
+        for other in ["11.3,2.6 size 4.8,2", "11.3,0 velocity 1,0 size 4.8,2"] {
+            let other = imitation(&format!("agent vehicle 1: {other}"), value);
+            assert_abs_diff_eq!(other.progress_m, free.progress_m, epsilon = 1e-9);
+        }
+    }
+}
+
+#[test]
 fn what_a_world_does_wrong_is_named() {
     let check = |frames: fn(&Frame) -> Vec<Frame>, expected: &str| {
         let world = Wrong(frames);

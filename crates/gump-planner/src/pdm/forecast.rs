@@ -22,6 +22,9 @@ pub(crate) enum Token {
     RedLight(LaneId),
 }
 
+/// Up to this speed an object stands, metres per second.
+const STANDING: f64 = 0.05;
+
 /// One object over all instants: at its known positions, then straight on.
 #[derive(Clone, Debug)]
 pub(crate) struct Object {
@@ -34,11 +37,13 @@ pub(crate) struct Object {
     swept: (DVec2, DVec2),
 }
 
-/// Pose, outline and speed of an object at a moment.
+/// Pose, outline and motion of an object at a moment.
 #[derive(Clone, Copy, Debug)]
 struct Spot {
     quad: Quad,
     pose: Pose,
+    /// World frame, metres per second.
+    velocity: DVec2,
     /// 0 for kinds that never move.
     speed: f64,
 }
@@ -70,6 +75,7 @@ impl Object {
             known: vec![Spot {
                 quad,
                 pose: agent.state.pose,
+                velocity,
                 speed,
             }],
             drift,
@@ -79,7 +85,7 @@ impl Object {
         object
     }
 
-    /// Adds simulated positions at the next instants, and the velocity after them.
+    /// Adds simulated positions at the next instants, and the velocity there and after them.
     pub(crate) fn imagine(&mut self, poses: impl Iterator<Item = Pose>, drift: DVec2) {
         for pose in poses {
             let state = AgentState {
@@ -89,6 +95,7 @@ impl Object {
             self.known.push(Spot {
                 quad: Quad::from(&self.agent.with_state(state).oriented_box()),
                 pose,
+                velocity: drift,
                 speed: drift.length(),
             });
         }
@@ -132,16 +139,17 @@ impl Object {
         spot.speed * turned.cos()
     }
 
+    /// True if it stands at a moment, or is of a kind that never moves.
+    pub(crate) fn stands(&self, moment: usize) -> bool {
+        self.at(moment).0.speed <= STANDING
+    }
+
     /// The agent at a moment.
     pub(crate) fn agent(&self, moment: usize) -> Agent {
         let (spot, offset) = self.at(moment);
         let mut pose = spot.pose;
         pose.position += offset;
-        let velocity = if self.known.len() == 1 {
-            self.agent.state.velocity
-        } else {
-            self.drift
-        };
+        let velocity = spot.velocity;
         self.agent.with_state(AgentState { pose, velocity })
     }
 

@@ -22,6 +22,8 @@ pub(crate) const NO_PROGRESS: f64 = 0.1;
 const TTC_STEPS: [usize; 4] = [0, 3, 6, 9];
 /// Below this speed, metres per second, an agent cannot run into another.
 const TTC_STANDING: f64 = 0.005;
+/// Distance that is kept behind who stands, metres: the one at which PDM's own drivers stop.
+pub(crate) const STANDSTILL_GAP_M: f64 = 1.0;
 /// Weights of progress, time to collision and comfort.
 pub(crate) const WEIGHTS: [f64; 3] = [5.0, 5.0, 2.0];
 
@@ -121,6 +123,24 @@ impl Judge<'_> {
     pub(crate) fn place(&self, state: &EgoState) -> f64 {
         let center = self.vehicle.center_of(state.rear_axle);
         self.centerline.project(center.position)
+    }
+
+    /// The step from which on, until the last, the ego is less than [`STANDSTILL_GAP_M`] behind
+    /// something that stands.
+    pub(crate) fn closes_up_at(&self, states: &[EgoState]) -> Option<usize> {
+        let is_close = |step: usize| {
+            let state = &states[step];
+            let shape = self.vehicle.footprint(state.rear_axle);
+            let way = state.rear_axle.direction() * STANDSTILL_GAP_M;
+            let ahead = Quad::new(shape.corners().map(|corner| corner + way));
+            self.forecast.objects.iter().any(|object| {
+                touches(&ahead, object, step / 2)
+                    && object.stands(step / 2)
+                    && is_ahead(state.rear_axle, object.center(step / 2))
+            })
+        };
+        let steps = (0..states.len()).rev();
+        steps.take_while(|&step| is_close(step)).last()
     }
 
     /// True if nothing after these states can open the gates of the score again.

@@ -123,6 +123,11 @@ impl Driving {
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         self.driving.check()?;
+        if self.imagination == Some(WorldName::Log) {
+            let wrong =
+                "--imagination: expected idm, constant-velocity or model:WEIGHTS, found log";
+            return Err(WrongArguments(wrong.into()).into());
+        }
         self.planner.iter().try_for_each(Chosen::check)?;
         let thinking = self.thinking.config()?;
         let sampling = self.sampling.resolve()?;
