@@ -132,13 +132,23 @@ fn remote(text: &str) -> Result<Chosen, String> {
     }
 }
 
-#[derive(Clone, Copy, Debug, Serialize, clap::ValueEnum)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, clap::ValueEnum)]
 #[serde(rename_all = "kebab-case")]
-enum YieldingName {
+pub(crate) enum YieldingName {
     /// Rules resample those that would hit it, whoever has the right of way
     Ruled,
     /// As the network itself reacts
     Learned,
+}
+
+impl YieldingName {
+    /// The sampling of a world with this choice.
+    pub(crate) fn sampling(self, sampling: &SamplingConfig) -> SamplingConfig {
+        SamplingConfig {
+            yields_to_driven: matches!(self, Self::Ruled),
+            ..sampling.clone()
+        }
+    }
 }
 
 /// Settings of planners with rollouts.
@@ -188,10 +198,7 @@ pub(crate) struct ImaginationArgs {
 impl ImaginationArgs {
     /// Sampling of the world of the rollouts: `sampling` with the choice of `--yielding`.
     pub(crate) fn sampling(&self, sampling: &SamplingConfig) -> SamplingConfig {
-        SamplingConfig {
-            yields_to_driven: matches!(self.yielding, YieldingName::Ruled),
-            ..sampling.clone()
-        }
+        self.yielding.sampling(sampling)
     }
 
     /// Converts the arguments to a [`PlannerConfig`].

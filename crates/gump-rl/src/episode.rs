@@ -4,9 +4,10 @@
 //! same successor. The caller chooses the traffic: [`Rules::step`] reads the other agents from the
 //! log, [`Rules::advance`] takes a frame of any world.
 
-use gump_geometry::{OrientedBox, angle_difference};
+use gump_geometry::{OrientedBox, Pose, angle_difference, dvec2};
+use gump_metrics::encounter::classify;
 use gump_metrics::{ComfortBounds, ComfortMeasurements};
-use gump_scene::{Agent, AgentKind, AgentState, Frame};
+use gump_scene::{Agent, AgentKind, AgentState, Frame, VehicleParameters};
 use serde::{Deserialize, Serialize};
 
 use crate::{Dynamics, PreparedScenario, RlError};
@@ -55,8 +56,10 @@ impl Default for Rules {
 pub struct RewardWeights {
     /// Per metre of progress along the route.
     pub progress: f64,
-    /// For a collision.
+    /// For a collision at the ego's fault.
     pub collision: f64,
+    /// For a collision in which the ego stands or is hit from behind.
+    pub blameless_collision: f64,
     /// For leaving the road.
     pub off_road: f64,
     /// For exceeding a comfort bound.
@@ -69,6 +72,7 @@ impl Default for RewardWeights {
         Self {
             progress: 0.1,
             collision: -5.0,
+            blameless_collision: -5.0,
             off_road: -5.0,
             discomfort: -0.05,
         }
@@ -122,6 +126,8 @@ pub struct Totals {
     pub progress: f64,
     /// True if the ego's box overlapped another.
     pub collided: bool,
+    /// True if it did so other than standing or hit from behind.
+    pub at_fault: bool,
     /// True if a corner of the ego's box left the road.
     pub off_road: bool,
     /// True if a comfort bound was exceeded.
@@ -228,7 +234,8 @@ impl Rules {
         };
         let moved = ego.pose.position.distance(now.pose.position);
         let progress = (next.along - state.along).clamp(-moved, moved);
-        let collided = collides(&way, before, after, FASTEST * dt);
+        let contact = contact(&way, before, after, FASTEST * dt);
+        let (collided, at_fault) = (contact.is_some(), contact == Some(Fault::Ego));
         let stride = n.div_ceil((moved / ROAD_TEST_SPACING).ceil().clamp(1.0, n as f64) as usize);
         let off_road = way
             .iter()
@@ -240,12 +247,14 @@ impl Rules {
         let weights = &self.reward;
         let happened = |weight: f64, it: bool| if it { weight } else { 0.0 };
         next.reward = weights.progress * progress
-            + happened(weights.collision, collided)
+            + happened(weights.collision, at_fault)
+            + happened(weights.blameless_collision, collided && !at_fault)
             + happened(weights.off_road, off_road)
             + happened(weights.discomfort, uncomfortable);
         next.totals.reward += next.reward;
         next.totals.progress += progress;
         next.totals.collided |= collided;
+        next.totals.at_fault |= at_fault;
         next.totals.off_road |= off_road;
         next.totals.uncomfortable |= uncomfortable;
         let horizon = (self.horizon / prepared.dt()).round().max(1.0) as usize;
@@ -340,26 +349,37 @@ fn turn_rate(from: &AgentState, to: &AgentState, dt: f64) -> f64 {
     angle_difference(to.pose.heading, from.pose.heading) / dt
 }
 
-/// [`gump_metrics::Collision`] of the ego at any moment of a step. `way` has the ego at evenly
-/// spaced moments, the last of them the step's end; no agent moves farther than `farthest` metres.
-fn collides(way: &[Agent], before: &Frame, after: &Frame, farthest: f64) -> bool {
+/// Who is to blame for a collision, by nuPlan's kinds of contact. Contacts from the side are the
+/// ego's fault here, since scenes need not say where lanes end.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+enum Fault {
+    /// Another, who ran into the ego from behind or while it stood.
+    Other,
+    /// The ego.
+    Ego,
+}
+
+/// [`gump_metrics::Collision`] of the ego at any moment of a step, and whose fault: the ego's if it
+/// is to blame for one of several. `way` has the ego at evenly spaced moments, the last of them the
+/// step's end; no agent moves farther than `farthest` metres.
+fn contact(way: &[Agent], before: &Frame, after: &Frame, farthest: f64) -> Option<Fault> {
     let own = way[way.len() - 1].oriented_box();
     let from_end = |ego: &Agent| ego.state.pose.position.distance(own.pose.position);
     let own_way = way.iter().map(from_end).fold(0.0, f64::max);
-    after.agents().iter().any(|other| {
+    let with = |other: &Agent| {
         let end = other.state.pose;
         // Half the sum of length and width is no less than half the diagonal.
         let size = (own.length + own.width + other.length + other.width) / 2.0;
         let distance = own.pose.position.distance_squared(end.position);
         let far = |reach: f64| distance >= reach * reach;
         if other.id == way[0].id || far(size + own_way + farthest) {
-            return false;
+            return None;
         }
         let start = before.agent(other.id).map_or(end, |then| then.state.pose);
         if far(size + own_way + start.position.distance(end.position)) {
-            return false;
+            return None;
         }
-        way.iter().enumerate().any(|(k, ego)| {
+        way.iter().enumerate().find_map(|(k, ego)| {
             let share = (k + 1) as f64 / way.len() as f64;
             let there = OrientedBox {
                 pose: if share < 1.0 {
@@ -369,11 +389,36 @@ fn collides(way: &[Agent], before: &Frame, after: &Frame, farthest: f64) -> bool
                 },
                 ..other.oriented_box()
             };
-            let ego = ego.oriented_box();
-            ego.pose.position.distance_squared(there.pose.position) < size * size
-                && ego.overlaps(&there)
+            let own = ego.oriented_box();
+            let touches = own.pose.position.distance_squared(there.pose.position) < size * size
+                && own.overlaps(&there);
+            touches.then(|| {
+                let other = other.with_state(AgentState {
+                    pose: there.pose,
+                    velocity: other.state.velocity,
+                });
+                fault(ego, &other)
+            })
         })
-    })
+    };
+    after.agents().iter().filter_map(with).max()
+}
+
+/// Whose fault it is that the ego touches an agent.
+fn fault(ego: &Agent, other: &Agent) -> Fault {
+    // nuPlan's vehicle has its rear axle at this share of its length behind its centre.
+    let vehicle = VehicleParameters::PACIFICA;
+    let behind = vehicle.rear_axle_to_center() / vehicle.length() * ego.length;
+    let rear_axle = Pose {
+        position: ego.state.pose * dvec2(-behind, 0.0),
+        ..ego.state.pose
+    };
+    let kind = classify(&ego.oriented_box(), rear_axle, ego.state.speed(), other);
+    if kind.is_at_fault(false) {
+        Fault::Ego
+    } else {
+        Fault::Other
+    }
 }
 
 /// [`gump_metrics::OffRoad`] of the ego.

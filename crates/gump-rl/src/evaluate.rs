@@ -44,6 +44,8 @@ pub struct EpisodeResult {
     pub repeat: usize,
     /// True if the ego's box overlapped another.
     pub collided: bool,
+    /// True if it did so other than standing or hit from behind.
+    pub at_fault: bool,
     /// True if a corner of the ego's box left the road.
     pub off_road: bool,
     /// Metres along the route.
@@ -61,6 +63,8 @@ pub struct Columns {
     pub score: f64,
     /// Share of episodes with a collision.
     pub collision_rate: f64,
+    /// Share of episodes with a collision in which the ego neither stood nor was hit from behind.
+    pub at_fault_rate: f64,
     /// Share of episodes that left the road.
     pub offroad_rate: f64,
     /// Mean progress of safe episodes, metres; `None` if there is none.
@@ -76,6 +80,7 @@ impl EpisodeResult {
             scenario,
             repeat,
             collided: totals.collided,
+            at_fault: totals.at_fault,
             off_road: totals.off_road,
             progress: totals.progress,
             comfortable: !totals.uncomfortable,
@@ -114,6 +119,7 @@ impl Columns {
         (!drives.is_empty()).then(|| Self {
             score: drives.iter().map(EpisodeResult::score).sum::<f64>() / n,
             collision_rate: share(|drive| drive.collided),
+            at_fault_rate: share(|drive| drive.at_fault),
             offroad_rate: share(|drive| drive.off_road),
             progress: of_safe(|drive| drive.progress),
             comfort: of_safe(|drive| f64::from(u8::from(drive.comfortable))),
@@ -404,6 +410,7 @@ mod tests {
             scenario,
             repeat: 0,
             collided,
+            at_fault: collided && scenario == 1,
             off_road,
             progress,
             comfortable,
@@ -421,6 +428,7 @@ mod tests {
         ];
         let columns = Columns::of(&drives).unwrap();
         assert_eq!((columns.collision_rate, columns.offroad_rate), (0.25, 0.25));
+        assert_eq!(columns.at_fault_rate, 0.25);
         assert_eq!((columns.progress, columns.comfort), (Some(62.0), Some(0.5)));
         // From the rates: half of the episodes are safe.
         assert!((columns.score - 0.5 * 0.5 * (1.0 + 0.5)).abs() < 1e-9);

@@ -7,6 +7,7 @@ use std::f64::consts::FRAC_PI_6;
 
 use gump_geometry::{OrientedBox, angle_difference};
 use gump_model::relative::graph::Shown;
+use gump_model::relative::route::Route;
 use gump_scene::{AgentKind, Lane, LaneId, MapGraph};
 
 use crate::relative::approach::{OVER_M, lane_under};
@@ -35,13 +36,13 @@ const BEHIND_M: f64 = 1.0;
 /// from its centre to that end, metres: on each of its ways a vehicle stands across it, or, where a light
 /// applies, anywhere before the place that it needs behind the junction.
 ///
-/// `agents` are all, `own` the index of the vehicle, `closes` says who can close a junction: not those
-/// that are parked in it. `None` where it may drive on, is in the junction already, or is farther than
+/// `agents` are all, `own` the index of the vehicle, which takes no way but that of its `route`, if it
+/// has one there. `closes` says who can close a junction: not those that are parked in it. `None` where it may drive on, is in the junction already, or is farther than
 /// `reach` metres from it.
 pub fn closed_entry<'m>(
     map: &'m MapGraph,
     agents: &[Shown],
-    own: usize,
+    (own, route): (usize, Option<&Route>),
     reach: f64,
     is_lit: impl Fn(LaneId) -> bool,
     closes: impl Fn(usize) -> bool,
@@ -55,22 +56,21 @@ pub fn closed_entry<'m>(
     let (mut lane, at) = lane_under(map, now.pose)?;
     let mut line = lane.centerline.length() - at;
     let front = now.body.length / 2.0;
-    // The last lane before the junction; lanes that fork before it leave the choice open.
+    let is_meant = |lane: &Lane| route.is_some_and(|route| route.lanes().contains(&lane.id));
+    // The last lane before the junction; lanes that fork before it leave the choice open, without a
+    // route.
     for _ in 0..LANES {
         if line >= reach || lane.in_intersection {
             break;
         }
-        let mut next = map.successors(lane.id);
-        let (Some(first), second) = (next.next(), next.next()) else {
-            return None;
-        };
-        if first.in_intersection {
+        let next: Vec<&Lane> = map.successors(lane.id).collect();
+        if next.first()?.in_intersection {
             break;
         }
-        if second.is_some() {
-            return None;
-        }
-        lane = first;
+        lane = match next[..] {
+            [only] => only,
+            _ => *next.iter().find(|lane| is_meant(lane))?,
+        };
         line += lane.centerline.length();
     }
     let leads_in = map.successors(lane.id).any(|lane| lane.in_intersection);
@@ -92,6 +92,13 @@ pub fn closed_entry<'m>(
     }
     let mut ways = Vec::new();
     walk(map, &mut vec![lane], &mut ways);
+    let follows_route = |way: &Vec<&Lane>| {
+        let mut inside = way[1..].iter().take_while(|lane| lane.in_intersection);
+        inside.all(|lane| is_meant(lane))
+    };
+    if ways.iter().any(follows_route) {
+        ways.retain(follows_route);
+    }
     let is_closed = |way: &Vec<&Lane>| {
         let is_lit = way.iter().any(|lane| is_lit(lane.id));
         standing.iter().any(|other| {
@@ -167,7 +174,8 @@ fn is_behind_it(now: &Shown, other: &Shown, lane: &Lane) -> bool {
 mod tests {
     use gump_geometry::{DVec2, Pose};
     use gump_model::relative::graph::Body;
-    use gump_scene::fixture;
+    use gump_model::relative::route::Traveller;
+    use gump_scene::{Seed, fixture};
 
     use super::*;
 
@@ -203,10 +211,35 @@ mod tests {
 
     /// Metres to the line where a vehicle at `x` has to wait among these others.
     fn closed(x: f64, others: &[Shown], is_lit: bool) -> Option<f64> {
+        closed_on(None, x, others, is_lit)
+    }
+
+    /// The same with a route into this lane.
+    fn closed_on(into: Option<i64>, x: f64, others: &[Shown], is_lit: bool) -> Option<f64> {
         let map = junction();
+        let route = into.map(|lane| {
+            let who = Traveller {
+                pose: Pose::new(x, 0.0, 0.0),
+                speed: 6.0,
+                seed: Seed(0),
+            };
+            let routes = (0..64).filter_map(|seed| {
+                let seed = Seed(seed);
+                Route::from_here(&map, Traveller { seed, ..who })
+            });
+            let mut routes = routes.filter(|route| route.lanes().contains(&LaneId(lane)));
+            routes.next().unwrap()
+        });
         let own = car(Pose::new(x, 0.0, 0.0), 6.0);
         let agents: Vec<Shown> = std::iter::once(own).chain(others.iter().copied()).collect();
-        let found = closed_entry(&map, &agents, 0, 25.0, |_| is_lit, |_| true);
+        let found = closed_entry(
+            &map,
+            &agents,
+            (0, route.as_ref()),
+            25.0,
+            |_| is_lit,
+            |_| true,
+        );
         found.map(|(lane, metres)| {
             assert_eq!(lane.id, LaneId(1));
             metres
@@ -246,6 +279,12 @@ mod tests {
         // Without a light, and if only one of the ways is full.
         assert_eq!(closed(-10.0, &queue(25.0), false), None);
         assert_eq!(closed(-10.0, &queue(25.0)[..1], true), None);
+        // That way is the route, or the other one is.
+        assert_eq!(
+            closed_on(Some(3), -10.0, &queue(25.0)[..1], true),
+            Some(10.0)
+        );
+        assert_eq!(closed_on(Some(5), -10.0, &queue(25.0)[..1], true), None);
         // One that stands in the junction along the way, where both ways still lie together.
         let inside = car(Pose::new(2.5, 0.0, 0.0), 0.0);
         assert_eq!(closed(-10.0, &[inside], true), Some(10.0));

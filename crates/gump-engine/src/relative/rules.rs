@@ -6,7 +6,7 @@
 //! three poses at once; here the second part of the checked horizon, one second, continues the
 //! drawn move.
 
-use gump_geometry::{DVec2, Polyline, Pose, angle_difference};
+use gump_geometry::{Polyline, Pose, angle_difference};
 use gump_model::local_context::LaneMap;
 use gump_model::relative::graph::{Lights, Shown};
 use gump_model::relative::route::Route;
@@ -294,7 +294,7 @@ impl<'l> Shut<'l> {
             let speed = agents[i].velocity().length();
             let stop = speed * speed / (2.0 * GENTLY) + speed * TOKEN_DT;
             let reach = stop + agents[i].body.length / 2.0 + LOOK_M;
-            let (lane, _) = closed_entry(map, agents, i, reach, is_lit, closes)?;
+            let (lane, _) = closed_entry(map, agents, (i, known[i].route), reach, is_lit, closes)?;
             Some(StopLine::at_end(lane))
         };
         let ways = |i: usize| match agents[i].body.kind {
@@ -411,27 +411,20 @@ pub(super) fn obey_lines(
     }
 }
 
-/// The attempt of [`start`], beyond those of other rules, which count from 0.
-const STARTS: usize = 1 << 10;
+/// First attempts of [`draw_again`] and of [`resolve`]: those of other rules count from 0, and draws of
+/// the same attempt are the same.
+pub(super) const STARTS: usize = 1 << 10;
+pub(super) const HALTS: usize = STARTS + 1;
+const RESOLVES: usize = 1 << 11;
 
-/// Draws the moves of agents that stand although nothing holds them once more. More draws would
-/// dissolve all queues that recorded and simulated logs show (result 23).
-pub(super) fn start(mut standing: Vec<usize>, moves: &mut [Pose], again: &mut Again<'_>) {
-    standing.retain(|&i| moves[i].position == DVec2::ZERO);
-    if standing.is_empty() {
-        return;
-    }
-    for (&i, step) in standing.iter().zip(again(&standing, STARTS)) {
-        moves[i] = step;
-    }
-}
-
-/// Draws the moves of these agents once more, whatever comes.
-pub(super) fn once_more(who: &[usize], moves: &mut [Pose], again: &mut Again<'_>) {
+/// Draws the moves of these agents once more, whatever comes: of those that stand although nothing holds
+/// them, and those that come to a halt or set off without need. More draws would dissolve all queues
+/// that recorded and simulated logs show (result 23).
+pub(super) fn draw_again(who: &[usize], attempt: usize, moves: &mut [Pose], again: &mut Again<'_>) {
     if who.is_empty() {
         return;
     }
-    for (&i, step) in who.iter().zip(again(who, STARTS + 1)) {
+    for (&i, step) in who.iter().zip(again(who, attempt)) {
         moves[i] = step;
     }
 }
@@ -481,7 +474,7 @@ pub fn resolve(
         if unclear.is_empty() {
             return;
         }
-        for (&i, step) in unclear.iter().zip(again(&unclear, attempt)) {
+        for (&i, step) in unclear.iter().zip(again(&unclear, RESOLVES + attempt)) {
             if crowd.improve(i, &ahead(agents[i].pose, step)) {
                 moves[i] = step;
             }
@@ -533,6 +526,7 @@ fn braking(now: &Shown, step: Pose) -> Option<(Pose, Way)> {
 
 #[cfg(test)]
 mod tests {
+    use gump_geometry::DVec2;
     use gump_model::relative::graph::Body;
     use gump_model::relative::route::Traveller;
     use gump_scene::{Seed, fixture};
@@ -575,6 +569,7 @@ mod tests {
             4,
             &mut moves,
             &mut |who, attempt| {
+                let attempt = attempt - RESOLVES;
                 calls.push((who.to_vec(), attempt));
                 who.iter()
                     .map(|_| straight([4.5, 1.0][attempt.min(1)]))
@@ -643,16 +638,37 @@ mod tests {
     }
 
     #[test]
-    fn who_could_go_is_drawn_once_more() {
-        let mut moves = [Pose::IDENTITY, Pose::IDENTITY, straight(2.0)];
-        let mut calls = Vec::new();
-        start(vec![0, 2], &mut moves, &mut |who, attempt| {
-            calls.push((who.to_vec(), attempt));
-            vec![straight(0.4); who.len()]
-        });
-        assert_eq!(calls, [(vec![0], STARTS)]);
-        assert_eq!(moves, [straight(0.4), Pose::IDENTITY, straight(2.0)]);
-        start(vec![2], &mut moves, &mut |_, _| unreachable!("it moves"));
+    fn rules_do_not_draw_the_same_moves() {
+        // A vehicle that ran a light until the last attempt, and would then run into another.
+        let mut streams = std::collections::BTreeSet::new();
+        let agents = [car(0.0, 4.0), car(9.0, 0.0)];
+        let mut moves = [straight(4.0), Pose::IDENTITY];
+        let mut again = |who: &[usize], attempt: usize| {
+            assert!(streams.insert(attempt), "{attempt} twice");
+            vec![straight(4.0); who.len()]
+        };
+        draw_again(&[], STARTS, &mut moves, &mut |_, _| unreachable!("nobody"));
+        draw_again(&[0], STARTS, &mut moves, &mut again);
+        draw_again(&[0], HALTS, &mut moves, &mut again);
+        let line = StopLine {
+            lane: LaneId(1),
+            line: Pose::new(4.0, 0.0, 0.0),
+            width: 4.0,
+            is_right: false,
+        };
+        let shut = lit(&[(&line, LightState::Red)]);
+        obey_lines(&agents[..1], None, &shut, 3, &mut moves[..1], &mut again);
+        moves[0] = straight(4.0);
+        let lane_map = LaneMap::default();
+        resolve(
+            &agents,
+            None,
+            (&lane_map, &|_| false),
+            3,
+            &mut moves,
+            &mut again,
+        );
+        assert_eq!(streams.len(), 8);
     }
 
     /// Lines of lights only, for one agent.

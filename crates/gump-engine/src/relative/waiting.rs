@@ -185,7 +185,7 @@ pub(super) fn released(
             let is_long = inside[i] || agents[i].waited_s > 2.0 * agents[i].patience_s;
             is_long && holding.iter().all(crosses) && is_held(&TIGHT).is_empty()
         };
-        if !is_shut(&reached, lights) && (holding.is_empty() || squeezes()) {
+        if !is_shut(&reached, lights, agent) && (holding.is_empty() || squeezes()) {
             free.push((i, reached));
         } else if inside[i]
             && holding
@@ -219,7 +219,7 @@ pub(super) fn released(
             others.any(|(stays, other)| holds(&reached, agent, other, stays, &USUAL))
         };
         let is_signed = || reached.iter().any(|part| has_sign(map, part.lane));
-        !reached.is_empty() && !is_shut(&reached, lights) && !is_signed() && !is_held()
+        !reached.is_empty() && !is_shut(&reached, lights, agent) && !is_signed() && !is_held()
     };
     let roll = (0..agents.len()).filter(rolls).collect();
     let goes_first = |(i, own): &(usize, Vec<LaneAhead<'_>>), (j, its): &(usize, Vec<_>)| {
@@ -251,7 +251,9 @@ fn in_the_way(map: &MapGraph, agents: &[Standing<'_>]) -> Vec<(usize, usize)> {
         all.filter(move |(_, one)| one.agent.kind == kind && one.waited_s > BEFORE_VEHICLE_S)
     };
     let mut found = Vec::new();
-    for (j, person) in stand(AgentKind::Pedestrian) {
+    // Not those driven from outside.
+    let people = stand(AgentKind::Pedestrian).filter(|(_, one)| one.patience_s.is_finite());
+    for (j, person) in people {
         let at = person.agent.state.pose.position;
         let holds_one = |one: &Standing<'_>| {
             let reach = one.agent.length + USUAL.ahead_m + SIDE_OF_PEOPLE_M;
@@ -440,14 +442,13 @@ fn ahead<'m>(map: &'m MapGraph, standing: &Standing<'_>) -> Vec<LaneAhead<'m>> {
     reached
 }
 
-/// Whether the lights ahead forbid every way on.
-fn is_shut(reached: &[LaneAhead<'_>], lights: &[Light]) -> bool {
+/// Whether the lights ahead forbid every way on: also to who stands over the line up to its middle.
+fn is_shut(reached: &[LaneAhead<'_>], lights: &[Light], agent: &Agent) -> bool {
     let mut is_one_shut = false;
     for part in reached {
         for light in lights.iter().filter(|light| light.lane == part.lane.id) {
             let at = part.metres_to_stop_line(light);
-            // Up to a metre behind the front bumper: it may stand a little over the line.
-            if !(-1.0..LOOK_M).contains(&at) {
+            if !(-agent.length / 2.0..LOOK_M).contains(&at) {
                 continue;
             }
             if light.state == LightState::Green {

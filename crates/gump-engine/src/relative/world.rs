@@ -36,11 +36,12 @@ use crate::nucleus::uniform;
 use crate::relative::engine::{Draw, KEPT, MapMemory, RelativeEngine, Workspace};
 use crate::relative::intent::Intent;
 use crate::relative::rules::{
-    Driven, Known, Shut, StopLine, kinematically_limited, obey_lines, once_more, resolve, start,
+    Driven, HALTS, Known, STARTS, Shut, StopLine, draw_again, kinematically_limited, obey_lines,
+    resolve,
 };
 use crate::relative::seen::{FrameIndex, ObservedAgent, add_presents};
 use crate::relative::turning_in::TakesWay;
-use crate::relative::waiting::{CLEARS_S, Standing, has_room_behind, released};
+use crate::relative::waiting::{Standing, has_room_behind, released};
 use crate::sampling::{Routes, SamplingConfig};
 
 pub use live::LiveFuture;
@@ -68,7 +69,7 @@ const PATIENCE_S: [f64; 2] = [9.0, 27.0];
 const CREEPS: f64 = 0.5;
 /// The speed of a restarted agent, metres per second. With 2 m/s vehicles start more often than in the
 /// log (result 23).
-const START: f64 = 1.0;
+const START: f64 = 1.01;
 /// After as many steps, nine seconds, vehicles without a reason to slow down are shown without
 /// their past (see [`View::is_free`](gump_model::relative::graph::View::is_free)), and are given
 /// routes.
@@ -639,7 +640,9 @@ impl Future {
     /// Lets vehicles turn into driveways, under the rules.
     fn turn_into_driveways(&mut self, driven: Option<AgentId>) {
         let driveways = &self.scene.driveways;
-        if driveways.ways.is_empty() {
+        let takes_one = |member: &Member| member.intent.turns_in().is_some();
+        // Who takes one of the last layout gives it up.
+        if driveways.ways.is_empty() && !self.members.iter().any(takes_one) {
             return;
         }
         let seed = self.seed.fork(ROUTES);
@@ -682,7 +685,6 @@ impl Future {
     /// outside is shown as it is, and keeps none of those waiting that could go.
     fn limit_waiting(&mut self, engine: &RelativeEngine, driven: Option<AgentId>) {
         let is_late = self.is_late();
-        let shortest = if is_late { CLEARS_S } else { PATIENCE_S[0] };
         let map = &self.scene.source;
         let mut limits = Vec::with_capacity(self.members.len());
         // Late, vehicles that only roll may be in it, too.
@@ -691,8 +693,10 @@ impl Future {
             member.could_go = false;
             member.backing = member.backing.saturating_sub(1);
             member.let_pass = member.let_pass.saturating_sub(1);
-            is_one_idle |= member.idle_s() > shortest;
-            let is_long = member.waited > WAITED_S && stands_in_lane(map, &member.agent);
+            is_one_idle |= member.idle_s() > PATIENCE_S[0];
+            let is_long = driven != Some(member.agent.id)
+                && member.waited > WAITED_S
+                && is_in_lane(map, &member.agent, IN_LANE.0);
             limits.push(is_long.then_some(WAITED_S));
         }
         if is_one_idle {
@@ -738,7 +742,9 @@ impl Future {
                 if member.backing > 0 {
                     continue;
                 }
-                member.let_pass = member.let_pass.max(GOES_ON);
+                if member.agent.kind != AgentKind::Pedestrian {
+                    member.let_pass = member.let_pass.max(GOES_ON);
+                }
                 member.could_go = true;
                 limits[i] = None;
                 member.seen.restart(engine, START);
@@ -790,15 +796,18 @@ impl Future {
         };
         let (lane_map, redraws) = (&self.scene.lane_map, sampling.redraws);
         let driven = driven.map(|(i, _)| i);
-        let could_go = |i: &usize| self.members[*i].could_go && driven != Some(*i);
-        let standing = (0..agents.len()).filter(could_go).collect();
-        start(standing, &mut moves, &mut again);
+        let stays = |i: &usize| {
+            let could_go = self.members[*i].could_go && driven != Some(*i);
+            could_go && moves[*i].position == DVec2::ZERO
+        };
+        let standing: Vec<usize> = (0..agents.len()).filter(stays).collect();
+        draw_again(&standing, STARTS, &mut moves, &mut again);
         let is_rare = |i: &usize| {
             let member = &self.members[*i];
             driven != Some(*i) && member.is_rare(&self.scene.source, moves[*i], streams[*i])
         };
         let rare: Vec<usize> = (0..agents.len()).filter(is_rare).collect();
-        once_more(&rare, &mut moves, &mut again);
+        draw_again(&rare, HALTS, &mut moves, &mut again);
         let lines = self.lines.iter().filter_map(|line| {
             let lights = &self.lights_now;
             let i = lights.binary_search_by_key(&line.lane, |light| light.lane);
@@ -824,35 +833,44 @@ impl Future {
         let known: Vec<Known<'_>> = known.collect();
         let shut = Shut::of(&self.scene.source, &agents, &known, lines, &colours);
         obey_lines(&agents, driven, &shut, redraws, &mut moves, &mut again);
-        // Redraws that keep agents clear of others must not make them cross such a line.
-        let kept = moves.clone();
+        self.back_up(driven, &mut moves);
+        // Redraws that keep agents clear of others must not make them break these rules, nor those who
+        // back up do anything else.
+        let before = moves.clone();
         let mut lawful = |who: &[usize], attempt: usize| -> Vec<Pose> {
+            let breaks = |i: usize, step: Pose| shut.forbids(&agents, i, step);
+            let is_held = |i: usize, step: Pose| {
+                let is_bound = agents[i].body.kind == AgentKind::Vehicle;
+                let backs = self.members[i].backing > 0 && driven != Some(i);
+                backs || is_bound && breaks(i, step) && !breaks(i, before[i])
+            };
             let drawn = who.iter().zip(again(who, attempt));
-            let held = drawn.map(|(&i, step)| match shut.forbids(&agents, i, step) {
-                true => kept[i],
+            let held = drawn.map(|(&i, step)| match is_held(i, step) {
+                true => before[i],
                 false => step,
             });
             held.collect()
         };
+        let who_drives = driven;
         let driven = driven.map(|index| Driven {
             index,
             is_heeded: sampling.yields_to_driven,
         });
-        self.back_up(&mut moves);
         let may_leave = |i: usize| {
             let way = &known[i].turns_in;
             way.is_some_and(|way| way.leaves_street(&agents[i]))
         };
         let edges = (lane_map, &may_leave as &dyn Fn(usize) -> bool);
         resolve(&agents, driven, edges, redraws, &mut moves, &mut lawful);
-        self.back_up(&mut moves);
+        self.back_up(who_drives, &mut moves);
         moves
     }
 
     /// The moves of those who back up for others, or wait afterwards until these have passed.
-    fn back_up(&self, moves: &mut [Pose]) {
+    fn back_up(&self, driven: Option<usize>, moves: &mut [Pose]) {
         let backing = self.members.iter().enumerate();
-        for (i, member) in backing.filter(|(_, member)| member.backing > 0) {
+        let backing = backing.filter(|(i, member)| member.backing > 0 && driven != Some(*i));
+        for (i, member) in backing {
             let members = self.members.iter().map(|member| &member.agent);
             let all = members.chain(&self.others);
             let backs = member.backing > WAITS_BACK && has_room_behind(&member.agent, all);
@@ -1065,11 +1083,6 @@ impl Member {
     }
 }
 
-/// Whether a vehicle stands in a lane, where others drive, and not beside it.
-fn stands_in_lane(map: &MapGraph, agent: &Agent) -> bool {
-    is_in_lane(map, agent, IN_LANE.0)
-}
-
 /// Whether a vehicle is within `reach` metres of a lane's centre, and aligned with it.
 fn is_in_lane(map: &MapGraph, agent: &Agent, reach: f64) -> bool {
     let pose = agent.state.pose;
@@ -1091,20 +1104,23 @@ fn body(agent: &Agent) -> Body {
     }
 }
 
-/// The lights of the last frame, and how long they have shown their colour as far as was seen.
+/// The lights of the last frame, and how long they have shown their colour as far as was seen: since
+/// they were first seen in it, as in training samples.
 fn lights_at(history: &[Frame], dt: f64) -> Lights {
     let Some((now, before)) = history.split_last() else {
         return Lights::default();
     };
     let by_lane = now.lights().iter().map(|light| {
-        let mut shown = 0;
-        let changed = before.iter().rev().find_map(|frame| {
+        let mut frames = 0;
+        let changed = before.iter().rev().enumerate().find_map(|(k, frame)| {
             let then = frame.light(light.lane)?.state;
-            shown += 1;
+            if then == light.state {
+                frames = k + 1;
+            }
             (then != light.state).then_some(then)
         });
         let seen = changed.is_some_and(|then| then != LightState::Unknown);
-        let elapsed = seen.then_some((shown - 1) as f64 * dt);
+        let elapsed = seen.then_some(frames as f64 * dt);
         (light.lane, light.state, elapsed)
     });
     Lights {

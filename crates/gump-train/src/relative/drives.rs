@@ -206,6 +206,7 @@ impl TrackDriver for NetworkDriver {
         seed: Seed,
     ) {
         let ruled = seed.fork(RULED).rng().random_bool(self.config.ruled);
+        let n_logged = tracks.len();
         if ruled {
             let n_frames = lights.len();
             self.config
@@ -224,10 +225,14 @@ impl TrackDriver for NetworkDriver {
         };
         let signs: Vec<Pose> = sign_lines(streets).collect();
         // Agents that are led away take their own poses for logged ones.
-        let logs: Vec<Vec<Option<Pose>>> = match ruled {
+        let mut logs: Vec<Vec<Option<Pose>>> = match ruled {
             true => tracks.iter().map(log_of).collect(),
             false => Vec::new(),
         };
+        for newcomer in logs.iter_mut().skip(n_logged) {
+            // Else a moving one would stop dead before a line: its later poses are placeholders.
+            newcomer.fill(None);
+        }
         let memory = self.engine.remember(map);
         let mut members: Vec<Option<ObservedAgent>> = tracks.iter().map(|_| None).collect();
         let (mut room, mut hidden) = (Workspace::default(), Vec::new());
@@ -284,8 +289,9 @@ impl TrackDriver for NetworkDriver {
                 };
                 let is_lit = |lane| lights.colour(lane).is_some();
                 let keeps_clear = |i: usize| {
-                    let closed =
-                        closed_entry(streets, &agents, i, ENTRY_M, is_lit, |j| !stays[here[j]]);
+                    let closed = closed_entry(streets, &agents, (i, None), ENTRY_M, is_lit, |j| {
+                        !stays[here[j]]
+                    });
                     closed.map_or(f64::INFINITY, |(_, m)| before_line(&agents[i], m, 0.0))
                 };
                 let mut given = Vec::new();

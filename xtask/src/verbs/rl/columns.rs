@@ -79,6 +79,9 @@ pub(super) struct DriveRecord {
     pub(super) policy: usize,
     repeat: usize,
     collided: bool,
+    /// None as of version 0.1.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    at_fault: Option<bool>,
     off_road: bool,
     progress: f64,
     comfortable: bool,
@@ -101,6 +104,7 @@ impl DriveRecord {
             policy,
             repeat: drive.repeat,
             collided: drive.collided,
+            at_fault: Some(drive.at_fault),
             off_road: drive.off_road,
             progress: drive.progress,
             comfortable: drive.comfortable,
@@ -114,6 +118,7 @@ impl DriveRecord {
             scenario,
             repeat: self.repeat,
             collided: self.collided,
+            at_fault: self.at_fault.unwrap_or(self.collided),
             off_road: self.off_road,
             progress: self.progress,
             comfortable: self.comfortable,
@@ -322,6 +327,7 @@ impl Group<'_> {
             "high": span.map(|span| span.high),
             "interval_over": over,
             "collision_rate": columns.map(|c| c.collision_rate),
+            "at_fault_rate": columns.map(|c| c.at_fault_rate),
             "offroad_rate": columns.map(|c| c.offroad_rate),
             "progress_m": columns.and_then(|c| c.progress),
             "comfort": columns.and_then(|c| c.comfort),
@@ -339,15 +345,15 @@ fn over(policies: bool) -> &'static str {
 
 fn csv(tested: &Tested, entries: &[Entry<Driven>]) -> anyhow::Result<String> {
     let mut csv = String::from(
-        "policy,train_world,test_world,file,scenario,repeat,collided,offroad,progress_m,\
-         comfortable,score\n",
+        "policy,train_world,test_world,file,scenario,repeat,collided,at_fault,offroad,\
+         progress_m,comfortable,score\n",
     );
     for entry in entries {
         for one in &entry.scores.drives {
             let policy = &tested.policies[one.policy];
             writeln!(
                 csv,
-                "{},{},{},{},{},{},{},{},{},{},{}",
+                "{},{},{},{},{},{},{},{},{},{},{},{}",
                 policy.policy,
                 policy.train_world.as_deref().unwrap_or(""),
                 tested.worlds[one.world],
@@ -355,6 +361,7 @@ fn csv(tested: &Tested, entries: &[Entry<Driven>]) -> anyhow::Result<String> {
                 entry.id,
                 one.repeat,
                 u8::from(one.collided),
+                u8::from(one.drive(0).at_fault),
                 u8::from(one.off_road),
                 one.progress,
                 u8::from(one.comfortable),
@@ -408,6 +415,7 @@ mod tests {
             policy,
             repeat: 0,
             collided: false,
+            at_fault: None,
             off_road: false,
             progress: 31.0 * (1 + index + policy) as f64,
             comfortable: true,

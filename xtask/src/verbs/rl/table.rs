@@ -114,7 +114,7 @@ impl Args {
             match DivergenceRecord::of(job)? {
                 Some(record) => diverged.push(DivergedPolicy {
                     policy: job.algorithm.to_string(),
-                    train_world: job.world_name.to_string(),
+                    train_world: job.world_name.clone(),
                     seed: job.seed.0.to_string(),
                     why: record.why,
                 }),
@@ -214,7 +214,7 @@ impl Args {
                 let folder = all.join(format!("{}-{k}", kind.name));
                 let job = Job {
                     algorithm: kind.algorithm,
-                    world_name: kind.world,
+                    world_name: kind.world.to_string(),
                     settings,
                     seed: Seed(run.seed().0 + k),
                     resume: folder.join("checkpoint.safetensors").exists(),
@@ -253,7 +253,7 @@ impl Args {
                 .with_context(|| format!("cannot create the folder {}", job.folder.display()))?;
             let (_, world) = worlds
                 .iter()
-                .find(|(name, _)| *name == job.world_name)
+                .find(|(name, _)| name.to_string() == job.world_name)
                 .with_context(|| format!("the world {} is not loaded", job.world_name))?;
             let place = Place {
                 world,
@@ -313,7 +313,7 @@ impl DivergenceRecord {
     }
 
     fn settings(job: &Job<'_>) -> anyhow::Result<String> {
-        let (algorithm, world, seed) = (job.algorithm, job.world_name, job.seed.0);
+        let (algorithm, world, seed) = (job.algorithm, &job.world_name, job.seed.0);
         let settings = toml::to_string(job.settings)?;
         Ok(format!("# {algorithm} in {world}, seed {seed}\n{settings}"))
     }

@@ -17,6 +17,7 @@ use super::learner::Learner;
 use super::{Notes, PreparedSet, RlWorld, Settings, read, write};
 use crate::choices::{ALGORITHMS, one_of};
 use crate::cli::WrongArguments;
+use crate::planners::YieldingName;
 use crate::run::{self, Common, Run};
 use crate::sampling::Sampling;
 
@@ -34,6 +35,9 @@ pub(crate) struct Args {
     /// log, idm, constant-velocity or model:WEIGHTS; imitation only with log
     #[arg(long, value_name = "W", default_value = "log")]
     train_world: WorldName,
+    /// Reaction to the ego of the agents of a learned world
+    #[arg(long, value_enum, default_value_t = YieldingName::Ruled)]
+    yielding: YieldingName,
     /// A file, a folder, or LIST.toml#SPLIT; of a list or a folder with a manifest.toml the train
     /// split
     #[arg(long, value_name = "SCENARIOS")]
@@ -61,7 +65,8 @@ pub(crate) struct Args {
 /// One policy to be trained.
 pub(super) struct Job<'a> {
     pub(super) algorithm: Algorithm,
-    pub(super) world_name: &'a WorldName,
+    /// Name of the world, with the choice of `--yielding` where it is not the default.
+    pub(super) world_name: String,
     pub(super) settings: &'a Settings,
     pub(super) seed: Seed,
     pub(super) folder: PathBuf,
@@ -119,7 +124,7 @@ impl Args {
             let wrong = "--train-world: imitation learns from the log, expected log";
             return Err(WrongArguments(wrong.into()).into());
         }
-        let sampling = self.sampling.resolve()?;
+        let sampling = self.yielding.sampling(&self.sampling.resolve()?);
         let set = PreparedSet::read(run, &self.scenarios, Split::Train, None)?;
         let device = run.device().clone();
         let world = run.phase("load", |_| {
@@ -132,7 +137,10 @@ impl Args {
         }
         let job = Job {
             algorithm: self.algorithm,
-            world_name: &self.train_world,
+            world_name: match self.yielding {
+                YieldingName::Ruled => self.train_world.to_string(),
+                YieldingName::Learned => format!("{}, yielding learned", self.train_world),
+            },
             settings: &settings,
             seed: run.seed(),
             folder: run.out().to_owned(),
@@ -169,7 +177,7 @@ impl Job<'_> {
     fn notes(&self) -> Notes {
         Notes {
             algorithm: self.algorithm.to_string(),
-            train_world: self.world_name.to_string(),
+            train_world: self.world_name.clone(),
             env: self.settings.env,
         }
     }

@@ -179,6 +179,36 @@ fn rules_keep_vehicles_on_the_road_wherever_the_map_is() {
 }
 
 #[test]
+fn a_light_has_shown_its_colour_since_it_was_first_seen_in_it() {
+    let light = |state: Option<LightState>| {
+        state.map(|state| Light {
+            lane: LaneId(1),
+            state,
+            stop_point: None,
+        })
+    };
+    let elapsed = |states: &[Option<LightState>]| {
+        let frame = |state: &Option<LightState>| {
+            Frame::new(Vec::new(), light(*state).into_iter().collect())
+        };
+        let frames: Vec<Frame> = states.iter().map(frame).collect();
+        lights_at(&frames, 0.1).by_lane[0].2
+    };
+    let (red, green) = (Some(LightState::Red), Some(LightState::Green));
+    let unknown = Some(LightState::Unknown);
+    assert_eq!(elapsed(&[red, green]), Some(0.0));
+    assert_eq!(elapsed(&[red, green, green, green]), Some(0.2));
+    // Out of sight in between, as in `gump_model`'s samples.
+    assert_eq!(
+        elapsed(&[red, green, None, None, green]),
+        Some(0.30000000000000004)
+    );
+    assert_eq!(elapsed(&[red, None, None, green]), Some(0.0));
+    assert_eq!(elapsed(&[green, green]), None);
+    assert_eq!(elapsed(&[unknown, green, green]), None);
+}
+
+#[test]
 fn lights_that_are_shown_later_stop_vehicles_too() {
     let (world, scenario) = (ruled(), fork());
     let lit = fixture::scenario(
