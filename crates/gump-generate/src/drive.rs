@@ -1,7 +1,7 @@
 //! A planned drive of the ego that matches a prompt: along lanes or to an adjacent one, with a
 //! speed profile, regardless of other agents.
 
-use gump_geometry::{DVec2, Polyline, Pose};
+use gump_geometry::{DVec2, Polyline, Pose, dvec2};
 use gump_rollout::{BoxError, Command, Policy};
 use gump_scene::{AgentState, Lane, LaneId, Light, LightState, MapGraph, Rng, SceneState};
 use rand::Rng as _;
@@ -111,7 +111,14 @@ impl PlannedDrive {
         let path = Polyline::new(points).filter(|path| path.length() >= needed - ENDS_M)?;
         // Nearer than 5 cm the centre line does as well, without the offset's kinks.
         drive.path = if offset.abs() > 0.05 {
-            path.offset(offset)
+            let there = path.pose_at(at) * dvec2(0.0, offset);
+            let beside = path.offset(offset);
+            // In a bend that path is longer or shorter.
+            drive.from = beside.project(there).arc_length;
+            for (_, begins) in &mut drive.entered {
+                *begins += drive.from - at;
+            }
+            beside
         } else {
             path
         };
@@ -317,6 +324,32 @@ mod tests {
             stop_point: None,
         }];
         assert!(drive.runs_red(&red, 4.8) && !drive.runs_red(&[], 4.8));
+    }
+
+    #[test]
+    fn beside_the_middle_of_a_bend_it_begins_where_it_is() {
+        // A quarter of a circle of 20 m, at whose end it is, on either side.
+        let arc: Vec<DVec2> = (0..=30)
+            .map(|i| DVec2::from_angle(std::f64::consts::FRAC_PI_2 * f64::from(i) / 30.0) * 20.0)
+            .chain([dvec2(-60.0, 20.0)])
+            .collect();
+        let points: Vec<String> = arc.iter().map(|p| format!("{},{}", p.x, p.y)).collect();
+        let text = format!("lane 1: {}\nego vehicle 0: 20,0", points.join(" "));
+        let scenario = fixture::scenario(&text).unwrap();
+        let map = &scenario.map;
+        let lane = &map.lanes()[0];
+        for offset in [-1.5, 1.5] {
+            let rng = &mut Seed(1).rng();
+            let start = (lane, 30.0);
+            let drive =
+                PlannedDrive::along(map, start, offset, 5.0, Maneuver::default(), rng).unwrap();
+            let expected = lane.centerline.pose_at(30.0) * dvec2(0.0, offset);
+            let found = drive.state_after(0.0).pose.position;
+            assert!(
+                found.distance(expected) < 0.05,
+                "{found} instead of {expected}"
+            );
+        }
     }
 
     #[test]

@@ -93,7 +93,10 @@ impl<'a> PartialScene<'a> {
         let Some(successor) = successor else {
             return self.keys.pop_front();
         };
-        if self.agents.len() > self.prepared.request.config.max_agents {
+        let due = self.wished.front().map(|object| object.class.kind());
+        // What was asked for comes all the same.
+        let is_full = self.agents.len() > self.prepared.request.config.max_agents;
+        if is_full && due.is_none() {
             return None;
         }
         let used: BTreeSet<u16> = self.agents.iter().map(|agent| agent.key.id).collect();
@@ -102,11 +105,11 @@ impl<'a> PartialScene<'a> {
         let last = last.filter(|key| !key.is_ego());
         let seed = self.stream(2 * self.agents.len() as u64 + 1);
         let drawn = births::next_key(successor, NEWBORN_AT, &used, last, seed, 1.0);
-        let Some(due) = self.wished.front().map(|object| object.class.kind()) else {
+        let Some(due) = due else {
             return drawn;
         };
         // A requested object comes first in its class, or at the latest then.
-        if drawn.is_some_and(|key| key.kind < due) {
+        if !is_full && drawn.is_some_and(|key| key.kind < due) {
             return drawn;
         }
         let after = last

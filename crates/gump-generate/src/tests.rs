@@ -130,6 +130,13 @@ fn the_network_may_decide_how_many_there_are() {
     for scene in &scenes {
         assert_eq!(scene.frame.agents()[0].id, scene.ego);
     }
+    // What was asked for comes all the same.
+    let bike = "[[object]]\nid = \"bike\"\nclass = \"bicycle\"\nspeed = [1, 2]";
+    request.objects = parse_constraints(bike).unwrap();
+    for scene in make(&request, 4) {
+        assert!(scene.names.contains_key("bike"));
+        assert!(scene.frame.agents().len() <= 14);
+    }
 }
 
 #[test]

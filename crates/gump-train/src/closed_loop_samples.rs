@@ -99,7 +99,7 @@ pub(crate) fn drive(
         .into_par_iter()
         .map(|i| {
             let seed = seed.fork(i as u64);
-            let scenario = (seed.fork(0).0 % scenarios.len() as u64) as usize;
+            let scenario = scenarios.pick(0, seed.fork(0).0);
             drive_one(
                 &world,
                 scenarios,

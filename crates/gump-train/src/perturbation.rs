@@ -46,7 +46,7 @@ pub(crate) fn lateral_perturbation(
             });
             off.push(rng);
             if agent.state.speed() < SLOWEST {
-                *off = Off::default();
+                (off.left_m, off.turn) = (0.0, 0.0);
             }
             let mut state = agent.state;
             state.pose.position += state.pose.rotate(DVec2::new(0.0, off.left_m));

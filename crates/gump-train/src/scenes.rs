@@ -32,7 +32,7 @@ pub trait ScenarioSource: Send + Sync {
         (draw % self.len() as u64) as usize
     }
 
-    /// Scenario `index`, which is below [`ScenarioSource::len`] or was returned by `pick`.
+    /// Scenario `index`, which `pick` returned; other numbers need not name one.
     ///
     /// # Errors
     /// [`TrainError::Source`] for one that cannot be read.

@@ -839,10 +839,13 @@ impl Future {
         let before = moves.clone();
         let mut lawful = |who: &[usize], attempt: usize| -> Vec<Pose> {
             let breaks = |i: usize, step: Pose| shut.forbids(&agents, i, step);
+            let length = |step: Pose| step.position.length();
             let is_held = |i: usize, step: Pose| {
                 let is_bound = agents[i].body.kind == AgentKind::Vehicle;
                 let backs = self.members[i].backing > 0 && driven != Some(i);
-                backs || is_bound && breaks(i, step) && !breaks(i, before[i])
+                // One that can no longer stop may at least be slower.
+                let is_worse = || !breaks(i, before[i]) || length(step) >= length(before[i]);
+                backs || is_bound && breaks(i, step) && is_worse()
             };
             let drawn = who.iter().zip(again(who, attempt));
             let held = drawn.map(|(&i, step)| match is_held(i, step) {

@@ -92,7 +92,7 @@ pub struct RelativeDrives {
     pub tolerance_m: f64,
     /// Divides the logits of the draws.
     pub temperature: f64,
-    /// Steps after which the driving network is updated.
+    /// Steps after which the driving network is updated; with rewards, the smaller of both.
     pub refresh: usize,
     /// Share of the driven samples whose agents move freely under the rules.
     pub ruled: f64,

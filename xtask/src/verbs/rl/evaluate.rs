@@ -125,7 +125,9 @@ impl Args {
         test.film(run, &set, self.films)
     }
 
-    /// Reads the policies; the environment is that of the config file, else that of the first.
+    /// Reads the policies; the environment is that of the config file, else that of all of them.
+    ///
+    /// Error: [`WrongArguments`] for policies of different environments without a config file.
     fn candidates(&self) -> anyhow::Result<(Vec<Candidate>, EnvConfig)> {
         let mut env = match &self.common.config {
             Some(path) => Some(Settings::read(Some(path))?.env),
@@ -134,6 +136,17 @@ impl Args {
         let mut candidates = Vec::new();
         for file in &self.policy {
             let (candidate, of_policy) = Candidate::read(file)?;
+            let is_given = self.common.config.is_some();
+            if let (Some(env), Some(own), false) = (&env, &of_policy, is_given)
+                && env != own
+            {
+                let wrong = format!(
+                    "--policy {}: it learned in another environment than the policies before it; \
+                     evaluate it apart, or give the environment with --config",
+                    file.display()
+                );
+                return Err(WrongArguments(wrong).into());
+            }
             env = env.or(of_policy);
             candidates.push(candidate);
         }

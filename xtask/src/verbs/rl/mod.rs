@@ -187,16 +187,21 @@ impl PreparedSet {
 struct Notes {
     algorithm: String,
     train_world: String,
+    /// The scenarios it learned on, as the command named them; none as of version 0.1.
+    scenes: Option<String>,
     env: EnvConfig,
 }
 
 impl Notes {
     fn to_map(&self) -> anyhow::Result<BTreeMap<String, String>> {
-        Ok(BTreeMap::from([
+        let mut notes = BTreeMap::from([
             ("algorithm".to_owned(), self.algorithm.clone()),
             ("train_world".to_owned(), self.train_world.clone()),
             ("env".to_owned(), toml::to_string(&self.env)?),
-        ]))
+        ]);
+        let scenes = self.scenes.clone();
+        notes.extend(scenes.map(|scenes| ("scenes".to_owned(), scenes)));
+        Ok(notes)
     }
 
     /// Error: an entry that is missing or invalid.
@@ -209,6 +214,7 @@ impl Notes {
         Ok(Self {
             algorithm: get("algorithm")?,
             train_world: get("train_world")?,
+            scenes: notes.get("scenes").cloned(),
             env: toml::from_str(&env)
                 .map_err(|error| anyhow::anyhow!("its environment: {}", error.message()))?,
         })
@@ -272,11 +278,13 @@ mod tests {
         let notes = Notes {
             algorithm: "sac".into(),
             train_world: "model:a.safetensors".into(),
+            scenes: Some("a.tfrecord".into()),
             env: EnvConfig::default(),
         };
         let found = Notes::from_map(&notes.to_map().unwrap()).unwrap();
         assert_eq!(found.env, notes.env);
         assert_eq!(found.train_world, notes.train_world);
+        assert_eq!(found.scenes, notes.scenes);
         assert!(Notes::from_map(&BTreeMap::new()).is_err());
     }
 }

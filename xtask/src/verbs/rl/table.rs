@@ -215,6 +215,7 @@ impl Args {
                 let job = Job {
                     algorithm: kind.algorithm,
                     world_name: kind.world.to_string(),
+                    scenes: self.scenarios.to_string(),
                     settings,
                     seed: Seed(run.seed().0 + k),
                     resume: folder.join("checkpoint.safetensors").exists(),
@@ -240,6 +241,7 @@ impl Args {
             if !self.shard.holds(index) {
                 continue;
             }
+            job.is_done()?;
             let record = DivergenceRecord::path(job);
             if DivergenceRecord::of(job)?.is_some() {
                 run.print(&format!(

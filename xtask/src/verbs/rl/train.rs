@@ -67,6 +67,8 @@ pub(super) struct Job<'a> {
     pub(super) algorithm: Algorithm,
     /// Name of the world, with the choice of `--yielding` where it is not the default.
     pub(super) world_name: String,
+    /// Name of the scenarios.
+    pub(super) scenes: String,
     pub(super) settings: &'a Settings,
     pub(super) seed: Seed,
     pub(super) folder: PathBuf,
@@ -141,6 +143,7 @@ impl Args {
                 YieldingName::Ruled => self.train_world.to_string(),
                 YieldingName::Learned => format!("{}, yielding learned", self.train_world),
             },
+            scenes: self.scenarios.to_string(),
             settings: &settings,
             seed: run.seed(),
             folder: run.out().to_owned(),
@@ -178,16 +181,27 @@ impl Job<'_> {
         Notes {
             algorithm: self.algorithm.to_string(),
             train_world: self.world_name.clone(),
+            scenes: Some(self.scenes.clone()),
             env: self.settings.env,
         }
     }
 
     /// Whether the run in the folder has made all of its steps.
     ///
-    /// Error: as [`Self::execute`].
+    /// Error: as [`Self::execute`], and another seed.
     pub(super) fn is_done(&self) -> anyhow::Result<bool> {
         let checkpoint = self.checkpoint();
-        Ok(checkpoint.exists() && self.resumed(&checkpoint, &self.notes())?.is_done())
+        if !checkpoint.exists() {
+            return Ok(false);
+        }
+        let found = self.resumed(&checkpoint, &self.notes())?;
+        let (here, there) = (self.seed.0, found.seed().0);
+        if here != there {
+            let folder = self.folder.display();
+            let wrong = format!("--seed: {folder} has a policy of seed {there}, expected {here}");
+            return Err(WrongArguments(wrong).into());
+        }
+        Ok(found.is_done())
     }
 
     /// Trains to the end, to `stop_at` or to Ctrl-C.
@@ -247,6 +261,11 @@ impl Job<'_> {
                 let wrong = format!("{flag} {requested}: the run to resume began with {begun}");
                 return Err(WrongArguments(wrong).into());
             }
+        }
+        if let Some(scenes) = found.scenes.filter(|scenes| *scenes != self.scenes) {
+            let here = &self.scenes;
+            let wrong = format!("--scenarios {here}: the run to resume began with {scenes}");
+            return Err(WrongArguments(wrong).into());
         }
         let (training, _) = Learner::from_bytes(self.algorithm, &bytes).with_context(in_file)?;
         training.check(self.settings)?;

@@ -105,7 +105,7 @@ impl LiveFuture {
         draws: Range<u64>,
         driven: Option<AgentId>,
     ) -> Vec<PredictiveSamples> {
-        let step = self.future.frames;
+        let step = self.future.frames - self.future.history;
         self.future
             .predictive_samples(&world.engine, &world.sampling, (draws, 0, step), driven)
     }
