@@ -329,8 +329,8 @@ mod tests {
     #[test]
     fn beside_the_middle_of_a_bend_it_begins_where_it_is() {
         // A quarter of a circle of 20 m, at whose end it is, on either side.
-        let arc: Vec<DVec2> = (0..=30)
-            .map(|i| DVec2::from_angle(std::f64::consts::FRAC_PI_2 * f64::from(i) / 30.0) * 20.0)
+        let arc: Vec<DVec2> = (0..=90)
+            .map(|i| DVec2::from_angle(std::f64::consts::FRAC_PI_2 * f64::from(i) / 90.0) * 20.0)
             .chain([dvec2(-60.0, 20.0)])
             .collect();
         let points: Vec<String> = arc.iter().map(|p| format!("{},{}", p.x, p.y)).collect();
