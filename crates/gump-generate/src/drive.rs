@@ -345,8 +345,9 @@ mod tests {
                 PlannedDrive::along(map, start, offset, 5.0, Maneuver::default(), rng).unwrap();
             let expected = lane.centerline.pose_at(30.0) * dvec2(0.0, offset);
             let found = drive.state_after(0.0).pose.position;
+            // The path is made of pieces of a metre.
             assert!(
-                found.distance(expected) < 0.05,
+                found.distance(expected) < 0.1,
                 "{found} instead of {expected}"
             );
         }
