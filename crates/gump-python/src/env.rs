@@ -226,6 +226,7 @@ impl Env {
             dict.set_item("return", episode.totals.reward)?;
             dict.set_item("progress", episode.totals.progress)?;
             dict.set_item("collided", episode.totals.collided)?;
+            dict.set_item("at_fault", episode.totals.at_fault)?;
             dict.set_item("off_road", episode.totals.off_road)?;
             dict.set_item("uncomfortable", episode.totals.uncomfortable)?;
             dict.set_item("last", self.observations(py, episode.last, None)?)?;

@@ -31,6 +31,7 @@ _KINDS: Dict[str, type] = {
     "return": float,
     "progress": float,
     "collided": bool,
+    "at_fault": bool,
     "off_road": bool,
     "uncomfortable": bool,
 }
@@ -49,8 +50,8 @@ class VectorEnv(_VectorBase):
     learned world faster.
 
     When an episode ends, `infos` tells its scenario (an index), steps, return, metres of progress, and
-    whether it collided, left the road or was uncomfortable; with `autoreset_mode="same_step"` under
-    `final_info`, as Gymnasium has it.
+    whether it collided, did so at its fault (neither standing nor hit from behind), left the road or
+    was uncomfortable; with `autoreset_mode="same_step"` under `final_info`, as Gymnasium has it.
 
     Raises `ValueError` for no scenarios, one that cannot be driven through, and choices that do not
     exist; later for actions of another shape or out of range, a step before the first reset, and an
