@@ -190,7 +190,7 @@ impl LossParts {
 /// One forward pass over samples of a batch that has `whole` targets: their part of its loss, for
 /// differentiation, and as numbers.
 ///
-/// With `dropout` the pass is a training pass; without, an evaluation.
+/// `training` decides whether batch norms use the batch; `dropout` is applied where it is given.
 pub(crate) fn loss(
     network: &Network,
     samples: &[Sample],

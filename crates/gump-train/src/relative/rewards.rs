@@ -121,7 +121,7 @@ impl Judged {
     }
 }
 
-/// A scene with only the agents nearest to its ego, all of which are scored.
+/// A scene with only the agents nearest to its ego; those that are in the log throughout are scored.
 fn nearest(scenario: &Scenario, most: usize) -> Scenario {
     let now = &scenario.log[scenario.now];
     let ego = now.agent(scenario.ego).map(|ego| ego.state.pose.position);
