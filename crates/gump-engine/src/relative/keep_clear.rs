@@ -37,8 +37,8 @@ const BEHIND_M: f64 = 1.0;
 /// applies, anywhere before the place that it needs behind the junction.
 ///
 /// `agents` are all, `own` the index of the vehicle, which takes no way but that of its `route`, if it
-/// has one there. `closes` says who can close a junction: not those that are parked in it. `None` where it may drive on, is in the junction already, or is farther than
-/// `reach` metres from it.
+/// has one there. `closes` says who can close a junction: not those that are parked in it. `None` where
+/// it may drive on, is in the junction already, or is farther than `reach` metres from it.
 pub fn closed_entry<'m>(
     map: &'m MapGraph,
     agents: &[Shown],

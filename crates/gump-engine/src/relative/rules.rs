@@ -411,11 +411,11 @@ pub(super) fn obey_lines(
     }
 }
 
-/// First attempts of [`draw_again`] and of [`resolve`]: those of other rules count from 0, and draws of
-/// the same attempt are the same.
+/// Attempts of [`draw_again`], and what is added to those of [`resolve`] where [`obey_lines`] has drawn
+/// before: both count from 0, and draws of the same attempt are the same.
 pub(super) const STARTS: usize = 1 << 10;
 pub(super) const HALTS: usize = STARTS + 1;
-const RESOLVES: usize = 1 << 11;
+pub(super) const RESOLVES: usize = 1 << 11;
 
 /// Draws the moves of these agents once more, whatever comes: of those that stand although nothing holds
 /// them, and those that come to a halt or set off without need. More draws would dissolve all queues
@@ -474,7 +474,7 @@ pub fn resolve(
         if unclear.is_empty() {
             return;
         }
-        for (&i, step) in unclear.iter().zip(again(&unclear, RESOLVES + attempt)) {
+        for (&i, step) in unclear.iter().zip(again(&unclear, attempt)) {
             if crowd.improve(i, &ahead(agents[i].pose, step)) {
                 moves[i] = step;
             }
@@ -569,7 +569,6 @@ mod tests {
             4,
             &mut moves,
             &mut |who, attempt| {
-                let attempt = attempt - RESOLVES;
                 calls.push((who.to_vec(), attempt));
                 who.iter()
                     .map(|_| straight([4.5, 1.0][attempt.min(1)]))
@@ -648,7 +647,8 @@ mod tests {
             vec![straight(4.0); who.len()]
         };
         draw_again(&[], STARTS, &mut moves, &mut |_, _| unreachable!("nobody"));
-        draw_again(&[0], STARTS, &mut moves, &mut again);
+        draw_again(&[1], STARTS, &mut moves, &mut again);
+        assert_eq!(moves, [straight(4.0); 2]);
         draw_again(&[0], HALTS, &mut moves, &mut again);
         let line = StopLine {
             lane: LaneId(1),
@@ -658,16 +658,11 @@ mod tests {
         };
         let shut = lit(&[(&line, LightState::Red)]);
         obey_lines(&agents[..1], None, &shut, 3, &mut moves[..1], &mut again);
-        moves[0] = straight(4.0);
+        moves = [straight(4.0), Pose::IDENTITY];
         let lane_map = LaneMap::default();
-        resolve(
-            &agents,
-            None,
-            (&lane_map, &|_| false),
-            3,
-            &mut moves,
-            &mut again,
-        );
+        let edges = (&lane_map, &(|_| false) as &dyn Fn(usize) -> bool);
+        let mut lawful = |who: &[usize], attempt| again(who, RESOLVES + attempt);
+        resolve(&agents, None, edges, 3, &mut moves, &mut lawful);
         assert_eq!(streams.len(), 8);
     }
 

@@ -36,8 +36,8 @@ use crate::nucleus::uniform;
 use crate::relative::engine::{Draw, KEPT, MapMemory, RelativeEngine, Workspace};
 use crate::relative::intent::Intent;
 use crate::relative::rules::{
-    Driven, HALTS, Known, STARTS, Shut, StopLine, draw_again, kinematically_limited, obey_lines,
-    resolve,
+    Driven, HALTS, Known, RESOLVES, STARTS, Shut, StopLine, draw_again, kinematically_limited,
+    obey_lines, resolve,
 };
 use crate::relative::seen::{FrameIndex, ObservedAgent, add_presents};
 use crate::relative::turning_in::TakesWay;
@@ -847,7 +847,7 @@ impl Future {
                 let is_worse = || !breaks(i, before[i]) || length(step) >= length(before[i]);
                 backs || is_bound && breaks(i, step) && is_worse()
             };
-            let drawn = who.iter().zip(again(who, attempt));
+            let drawn = who.iter().zip(again(who, RESOLVES + attempt));
             let held = drawn.map(|(&i, step)| match is_held(i, step) {
                 true => before[i],
                 false => step,

@@ -360,26 +360,27 @@ fn parked_vehicles_stay_where_the_log_has_them() {
          agent vehicle 4: 180,0",
     )
     .unwrap();
-    // Agents are numbered by their distance to the ego.
-    let moving = |seed: u64| -> Vec<u32> {
+    // Agents are numbered by their distance to one of them.
+    let moving = |seed: u64| {
         let sample = draw(&scenario, &SampleConfig::plain(), Some(&driver), Seed(seed)).unwrap();
         let last = sample.targets.iter().map(|target| target.agent).max();
         assert_eq!(last, Some(4));
-        let starts = |agent: &u32| {
-            let own = sample.targets.iter().filter(|t| t.agent == *agent);
-            let moves: Vec<_> = own.skip(1).map(|t| t.bins[0] != grid::STANDS).collect();
+        let starts = |agent| {
+            let own = sample.targets.iter().filter(|t| t.agent == agent).skip(1);
+            let moves: Vec<_> = own.map(|t| t.bins[0] != grid::STANDS).collect();
             assert!(!moves.is_empty());
             moves.contains(&true)
         };
-        (0..5).filter(starts).collect()
+        (0..5).filter(|agent| starts(*agent)).count()
     };
-    let moving: Vec<Vec<u32>> = (0..20).map(moving).collect();
-    let starts = |agent: u32| moving.iter().filter(|who| who.contains(&agent)).count();
-    assert_eq!([starts(0), starts(2)], [20, 20], "who moves, and a person");
-    assert_eq!(starts(1), 0, "beside the lane");
-    // On a free road, as long as nobody walks before it. The one at the end of its lane may have stopped
-    // for it; it stands in most of its samples: who starts is not to jump.
-    assert!(starts(3) <= 1 && starts(4) < 20, "{moving:?}");
+    // The one at the end of its lane may have stopped for it; it stands in most samples: who starts is
+    // not to jump.
+    let most = (0..20).map(moving).max();
+    assert_eq!(
+        most,
+        Some(3),
+        "all but the one beside the lane and the one on a free road"
+    );
 }
 
 /// A random network does not wait at lights; a vehicle whose log does is held there. At the end of a road
