@@ -2,7 +2,7 @@
 //! recording moved onto this map.
 
 use gump_engine::placement::object_spec::agent_of;
-use gump_geometry::{DVec2, angle_difference};
+use gump_geometry::DVec2;
 use gump_metrics::overlapping;
 use gump_scene::{
     Agent, AgentId, AgentKind, AgentState, Frame, Lane, LaneKind, MapGraph, SceneState, Seed,
@@ -95,10 +95,7 @@ pub fn wrong_way(map: &MapGraph, frame: &Frame) -> (usize, usize) {
         let pose = agent.state.pose;
         let turns = map
             .lanes_near(pose.position, ON_LANE_M)
-            .map(|(lane, _)| {
-                let at = lane.centerline.project(pose.position).arc_length;
-                angle_difference(lane.centerline.pose_at(at).heading, pose.heading).abs()
-            })
+            .map(|(lane, _)| lane.foot(pose).turned)
             .reduce(f64::min);
         if let Some(turn) = turns {
             judged += 1;

@@ -3,7 +3,7 @@
 //! Whether the tags hold in the trial of a place determines, without a network, whether a map
 //! admits them.
 
-use gump_geometry::{Pose, angle_difference};
+use gump_geometry::Pose;
 use gump_metrics::tags;
 use gump_scene::{Lane, LaneKind, MapGraph, Rng, ScenarioTag, Seed};
 use rand::Rng as _;
@@ -45,16 +45,15 @@ impl Search<'_> {
         let mut lanes = Vec::new();
         // The lane that the ego is on, or beside: about a lane's width off and 30 degrees turned.
         for (lane, _) in map.lanes_near(pose.position, 3.0) {
-            let on = lane.centerline.project(pose.position);
-            let way = lane.centerline.pose_at(on.arc_length).heading;
-            if angle_difference(way, pose.heading).abs() < 0.5 {
+            let on = lane.foot(pose);
+            if on.turned < 0.5 {
                 lanes.push((lane, on));
             }
         }
         lanes.retain(|(lane, _)| lane.kind != LaneKind::BikeLane);
         for _ in 0..TRIALS {
             let (lane, on) = lanes.choose(rng)?;
-            let site = self.site((lane, on.arc_length), on.lateral, rng);
+            let site = self.site((lane, on.along_m), on.lateral_m, rng);
             if let Some(mut site) = site.filter(|site| self.holds(site)) {
                 site.ego.pose = pose;
                 return Some(site);

@@ -112,11 +112,7 @@ pub(crate) fn meets_in_junction(own: &OrientedBox, map: &MapGraph, others: &[Ori
 /// The lane in whose middle an agent is, if there is one.
 fn lane_of(pose: Pose, map: &MapGraph) -> Option<&Lane> {
     let near = map.lanes_near(pose.position, IN_LANE_M);
-    let along = near.filter(|(lane, _)| {
-        let at = lane.centerline.project(pose.position).arc_length;
-        let heading = lane.centerline.pose_at(at).heading;
-        angle_difference(heading, pose.heading).abs() < ALONG
-    });
+    let along = near.filter(|(lane, _)| lane.foot(pose).turned < ALONG);
     let nearest = along.min_by(|a, b| a.1.total_cmp(&b.1).then(a.0.id.cmp(&b.0.id)));
     nearest.map(|(lane, _)| lane)
 }

@@ -54,8 +54,8 @@ pub use gump_seed::{Rng, Seed, standard_normal};
 pub use lanes_ahead::{LaneAhead, PointAhead, lanes_ahead};
 pub use light_index::{MAX_LIGHTS, light_indices, light_indices_of};
 pub use map::{
-    Area, AreaKind, Lane, LaneId, LaneKind, MapError, MapParts, RoadEdge, RoadEdgeKind, RoadLine,
-    RoadLineKind, Roadblock, RoadblockId, StopSign, TYPICAL_SPEED_LIMIT, Unstated,
+    Area, AreaKind, Lane, LaneFoot, LaneId, LaneKind, MapError, MapParts, RoadEdge, RoadEdgeKind,
+    RoadLine, RoadLineKind, Roadblock, RoadblockId, StopSign, TYPICAL_SPEED_LIMIT, Unstated,
 };
 pub use map_graph::MapGraph;
 pub use prediction::{PredictedMode, Prediction};

@@ -5,7 +5,7 @@
 use std::borrow::Cow;
 use std::fmt;
 
-use gump_geometry::{DVec3, Polygon, Polyline};
+use gump_geometry::{DVec3, Polygon, Polyline, Pose, angle_difference};
 
 /// Identity of a lane, unique within a map.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -129,6 +129,17 @@ impl Lane {
         }
     }
 
+    /// Where on the lane a pose is: the nearest point of its centre line, and the angle to it.
+    pub fn foot(&self, pose: Pose) -> LaneFoot {
+        let foot = self.centerline.project(pose.position);
+        let way = self.centerline.pose_at(foot.arc_length).heading;
+        LaneFoot {
+            along_m: foot.arc_length,
+            lateral_m: foot.lateral,
+            turned: angle_difference(way, pose.heading).abs(),
+        }
+    }
+
     /// The stated outline, else the centre line widened to the lane's width, with flat ends;
     /// `None` for a lane without either.
     pub fn surface(&self) -> Option<Cow<'_, Polygon>> {
@@ -137,6 +148,17 @@ impl Lane {
             None => self.centerline.ribbon(self.width).map(Cow::Owned),
         }
     }
+}
+
+/// Where on a lane a pose is, from [`Lane::foot`].
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct LaneFoot {
+    /// Metres along the centre line, from 0 to its length.
+    pub along_m: f64,
+    /// Metres from the centre line, positive to its left.
+    pub lateral_m: f64,
+    /// Radians from the lane's direction, to either side.
+    pub turned: f64,
 }
 
 /// Lanes side by side in one direction between two intersections, or the links of two such groups

@@ -375,15 +375,10 @@ impl Flow {
 fn ends_at(map: &MapGraph, agent: &Agent) -> bool {
     let pose = agent.state.pose;
     let lanes = map.lanes_near(pose.position, 3.0);
-    let along = lanes.filter(|(lane, _)| {
-        let foot = lane.centerline.project(pose.position);
-        let heading = lane.centerline.pose_at(foot.arc_length).heading;
-        gump_geometry::angle_difference(heading, pose.heading).abs() < 0.8
-    });
+    let along = lanes.filter(|(lane, _)| lane.foot(pose).turned < 0.8);
     let nearest = along.min_by(|a, b| a.1.total_cmp(&b.1).then(a.0.id.cmp(&b.0.id)));
     nearest.is_some_and(|(lane, _)| {
-        let foot = lane.centerline.project(pose.position);
-        let left = lane.centerline.length() - foot.arc_length - agent.length / 2.0;
+        let left = lane.centerline.length() - lane.foot(pose).along_m - agent.length / 2.0;
         left < END_M && map.successors(lane.id).next().is_none()
     })
 }

@@ -4,7 +4,7 @@
 
 use std::f64::consts::FRAC_PI_6;
 
-use gump_geometry::{Pose, angle_difference};
+use gump_geometry::Pose;
 use gump_model::relative::graph::Shown;
 use gump_model::relative::route::Route;
 use gump_model::steps::TOKEN_DT;
@@ -92,9 +92,8 @@ pub fn lane_under(streets: &MapGraph, pose: Pose) -> Option<(&Lane, f64)> {
 pub fn lanes_under(streets: &MapGraph, pose: Pose) -> impl Iterator<Item = (&Lane, f64, f64)> {
     let lanes = streets.lanes_near(pose.position, IN_LANE_M);
     lanes.filter_map(move |(lane, distance)| {
-        let at = lane.centerline.project(pose.position).arc_length;
-        let way = lane.centerline.pose_at(at).heading;
-        (angle_difference(way, pose.heading).abs() <= IN_LANE).then_some((lane, at, distance))
+        let foot = lane.foot(pose);
+        (foot.turned <= IN_LANE).then_some((lane, foot.along_m, distance))
     })
 }
 

@@ -161,13 +161,10 @@ fn is_across(now: &Shown, other: &Shown, lane: &Lane, also_along: bool) -> bool 
 
 /// Whether a vehicle stands on the lane behind the junction where another needs its place.
 fn is_behind_it(now: &Shown, other: &Shown, lane: &Lane) -> bool {
-    let foot = lane.centerline.project(other.pose.position);
-    let heading = lane.centerline.pose_at(foot.arc_length).heading;
-    let rear = foot.arc_length - other.body.length / 2.0;
-    let is_on = foot.distance < ON_LANE_M && foot.arc_length > 0.0;
-    is_on
-        && angle_difference(heading, other.pose.heading).abs() < ALONG
-        && rear < now.body.length + BEHIND_M
+    let foot = lane.foot(other.pose);
+    let rear = foot.along_m - other.body.length / 2.0;
+    let is_on = foot.lateral_m.abs() < ON_LANE_M && foot.along_m > 0.0;
+    is_on && foot.turned < ALONG && rear < now.body.length + BEHIND_M
 }
 
 #[cfg(test)]

@@ -1,6 +1,5 @@
 //! Vehicles that turn into driveways.
 
-use gump_geometry::angle_difference;
 use gump_model::relative::driveway::{Driveways, WayIn};
 use gump_model::relative::graph::Shown;
 use gump_scene::{Agent, AgentKind, BendLimits, Lane, LaneId, MapGraph, Seed, bend_speed};
@@ -81,9 +80,8 @@ impl<'a> TakesWay<'a> {
 }
 
 fn is_on(lane: &Lane, now: &Shown, (metres, radians): (f64, f64)) -> bool {
-    let on = lane.centerline.project(now.pose.position);
-    let way = lane.centerline.pose_at(on.arc_length).heading;
-    on.distance < metres && angle_difference(way, now.pose.heading).abs() < radians
+    let foot = lane.foot(now.pose);
+    foot.lateral_m.abs() < metres && foot.turned < radians
 }
 
 /// The way that a vehicle decides to take now, if no other agent stands in it. `seed` is its own: it

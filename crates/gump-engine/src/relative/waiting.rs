@@ -418,9 +418,8 @@ fn ahead<'m>(map: &'m MapGraph, standing: &Standing<'_>) -> Vec<LaneAhead<'m>> {
     };
     let pose = agent.state.pose;
     let along = |lane: &Lane| {
-        let at = lane.centerline.project(pose.position).arc_length;
-        let heading = lane.centerline.pose_at(at).heading;
-        (angle_difference(heading, pose.heading).abs() < turned).then_some(at)
+        let foot = lane.foot(pose);
+        (foot.turned < turned).then_some(foot.along_m)
     };
     let near = map.lanes_near(pose.position, beside);
     let near = near.filter(|(lane, metres)| *metres <= ASTRAY_M || lane.in_intersection);

@@ -11,7 +11,7 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::{Arc, Mutex, PoisonError, Weak};
 
-use gump_geometry::{DVec2, Pose, angle_difference};
+use gump_geometry::{DVec2, Pose};
 use gump_kernels::panels::Precision;
 use gump_model::ModelError;
 use gump_model::local_context::LaneMap;
@@ -1089,11 +1089,7 @@ impl Member {
 /// Whether a vehicle is within `reach` metres of a lane's centre, and aligned with it.
 fn is_in_lane(map: &MapGraph, agent: &Agent, reach: f64) -> bool {
     let pose = agent.state.pose;
-    let is_along = |lane: &Lane| {
-        let at = lane.centerline.project(pose.position).arc_length;
-        let heading = lane.centerline.pose_at(at).heading;
-        angle_difference(heading, pose.heading).abs() < IN_LANE.1
-    };
+    let is_along = |lane: &Lane| lane.foot(pose).turned < IN_LANE.1;
     let mut lanes = map.lanes_near(pose.position, reach);
     agent.kind == AgentKind::Vehicle && lanes.any(|(lane, _)| is_along(lane))
 }

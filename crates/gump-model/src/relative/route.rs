@@ -85,19 +85,20 @@ struct On<'a> {
     cost: f64,
 }
 
-fn cost(lane: &Lane, distance: f64, pose: Pose) -> f64 {
-    let at = lane.centerline.project(pose.position).arc_length;
-    let way = lane.centerline.pose_at(at).heading;
-    distance + METRES_PER_RADIAN * angle_difference(way, pose.heading).abs()
+fn cost(lane: &Lane, pose: Pose) -> f64 {
+    let foot = lane.foot(pose);
+    foot.lateral_m.abs() + METRES_PER_RADIAN * foot.turned
 }
 
 /// The lanes that a vehicle may be on.
 fn lanes_at(map: &MapGraph, pose: Pose) -> Vec<On<'_>> {
     let near = map.lanes_near(pose.position, ON_LANE_M);
-    let on = near.map(|(lane, distance)| (distance, cost(lane, distance, pose), lane));
-    on.filter(|(distance, cost, _)| cost - distance <= METRES_PER_RADIAN * ON_LANE)
-        .map(|(_, cost, lane)| On { lane, cost })
-        .collect()
+    let on = near.filter(|(lane, _)| lane.foot(pose).turned <= ON_LANE);
+    on.map(|(lane, _)| {
+        let cost = cost(lane, pose);
+        On { lane, cost }
+    })
+    .collect()
 }
 
 impl Route {
@@ -139,8 +140,7 @@ impl Route {
         let lanes = self.lanes.iter().enumerate();
         let lanes = lanes.filter_map(|(i, id)| {
             let lane = map.lane(*id)?;
-            let distance = lane.centerline.project(who.pose.position).distance;
-            Some((cost(lane, distance, who.pose), i))
+            Some((cost(lane, who.pose), i))
         });
         let (least, at) = lanes.min_by(|a, b| a.0.total_cmp(&b.0))?;
         let lost = if changes_lane { LOST_BESIDE_M } else { LOST_M };
@@ -174,10 +174,7 @@ impl Route {
     /// How far a vehicle is from the route, metres; a difference of direction counts as well.
     pub fn offset_m(&self, map: &MapGraph, pose: Pose) -> f64 {
         let lanes = self.lanes.iter().filter_map(|id| map.lane(*id));
-        let costs = lanes.map(|lane| {
-            let distance = lane.centerline.project(pose.position).distance;
-            cost(lane, distance, pose)
-        });
+        let costs = lanes.map(|lane| cost(lane, pose));
         costs.fold(f64::INFINITY, f64::min)
     }
 

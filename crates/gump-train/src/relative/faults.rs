@@ -250,9 +250,7 @@ fn is_at_junction(streets: &MapGraph, (lane, at): (&Lane, f64)) -> bool {
 fn astray(streets: &MapGraph, pose: Pose) -> f64 {
     let near = streets.lanes_near(pose.position, LOOK_M);
     let off = near.map(|(lane, distance)| {
-        let at = lane.centerline.project(pose.position).arc_length;
-        let way = lane.centerline.pose_at(at).heading;
-        let turned = angle_difference(way, pose.heading).abs();
+        let turned = lane.foot(pose).turned;
         (distance - NEAR_LANE_M).max(0.0) + PER_RADIAN * (turned - ALONG).max(0.0)
     });
     off.fold(LOOK_M - NEAR_LANE_M, f64::min)

@@ -54,9 +54,8 @@ impl Traffic {
                 let Some(&own) = places.index.get(&lane.id) else {
                     continue;
                 };
-                let at = lane.centerline.project(pose.position).arc_length;
-                let way = lane.centerline.pose_at(at).heading;
-                if angle_difference(way, pose.heading).abs() > ALONG {
+                let foot = lane.foot(pose);
+                if foot.turned > ALONG {
                     continue;
                 }
                 let seen = |along: f64| OnLane {
@@ -66,12 +65,12 @@ impl Traffic {
                 };
                 for (chain, i) in places.chains.iter().zip(0..) {
                     if let Some((_, base)) = chain.ahead.iter().find(|(lane, _)| *lane == own) {
-                        on_lanes[i].push(seen(base + at));
+                        on_lanes[i].push(seen(base + foot.along_m));
                     }
                 }
                 for (lane, base) in &places.chains[own as usize].ahead {
                     if *lane != own {
-                        on_lanes[*lane as usize].push(seen(at - base));
+                        on_lanes[*lane as usize].push(seen(foot.along_m - base));
                     }
                 }
             }
