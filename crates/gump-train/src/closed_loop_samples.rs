@@ -55,6 +55,37 @@ impl Default for ClosedLoopConfig {
     }
 }
 
+impl ClosedLoopConfig {
+    /// Error: [`TrainError::Config`] naming the first number out of its range.
+    pub(crate) fn validate(&self) -> Result<(), TrainError> {
+        let fail = |key: &'static str, what: String| {
+            let reason = format!("{key} must be {what}");
+            Err(TrainError::Config { key, reason })
+        };
+        for (key, value) in [
+            ("closed_loop.drives", self.drives),
+            ("closed_loop.candidates", self.candidates),
+        ] {
+            if value == 0 {
+                return fail(key, "at least 1, found 0".into());
+            }
+        }
+        for (key, share) in [
+            ("closed_loop.share", self.share),
+            ("closed_loop.slack", self.slack),
+        ] {
+            if !(0.0..=1.0).contains(&share) {
+                return fail(key, format!("between 0 and 1, found {share}"));
+            }
+        }
+        if !self.temperature.is_finite() || self.temperature <= 0.0 {
+            let key = "closed_loop.temperature";
+            return fail(key, format!("above 0, found {}", self.temperature));
+        }
+        Ok(())
+    }
+}
+
 /// A scenario as driven by the network.
 #[derive(Clone, Debug)]
 pub(crate) struct DrivenScenario {

@@ -85,6 +85,10 @@ impl TrainConfig {
                 ),
             );
         }
+        self.sample.validate()?;
+        if let Some(drives) = &self.closed_loop {
+            drives.validate()?;
+        }
         self.optimizer.validate()?;
         match self.ema {
             Some(ema) if !(0.0..1.0).contains(&ema) => {

@@ -220,6 +220,34 @@ fn rates_fall_at_milestones() {
 }
 
 #[test]
+fn numbers_out_of_their_ranges_are_named() {
+    type Change = fn(&mut TrainConfig);
+    let refused = |change: Change| {
+        let mut wrong = config(4);
+        wrong.closed_loop = Some(ClosedLoopConfig::default());
+        change(&mut wrong);
+        wrong.validate(1).map_err(|error| error.to_string())
+    };
+    assert_eq!(refused(|_| ()), Ok(()));
+    let changes: [(&str, Change); 6] = [
+        ("sample.frames", |c| c.sample.frames = 1),
+        ("sample.max_agents", |c| c.sample.max_agents = 0),
+        ("sample.agent_dropout", |c| c.sample.agent_dropout = 1.5),
+        ("sample.rotation", |c| c.sample.rotation = f64::NAN),
+        ("closed_loop.candidates", |c| {
+            c.closed_loop.as_mut().unwrap().candidates = 0;
+        }),
+        ("closed_loop.share", |c| {
+            c.closed_loop.as_mut().unwrap().share = -0.1;
+        }),
+    ];
+    for (key, change) in changes {
+        let error = refused(change).unwrap_err();
+        assert!(error.contains(key), "{key}: {error}");
+    }
+}
+
+#[test]
 fn so_it_is_with_an_average_and_batches_in_parts() {
     check_resumed(&TrainConfig {
         ema: Some(0.9),

@@ -100,6 +100,17 @@ impl RelativeTrainConfig {
             });
         }
         let sample = &self.sample;
+        // A target is the frame after one that is seen.
+        let counts = [
+            ("sample.frames", sample.frames, 2),
+            ("sample.max_agents", sample.max_agents, 1),
+        ];
+        if let Some((key, found, least)) = counts.iter().find(|(_, found, least)| found < least) {
+            return Err(TrainError::Config {
+                key,
+                reason: format!("{key} must be at least {least}, found {found}"),
+            });
+        }
         let probabilities = [
             ("sample.perturbed", sample.perturbed),
             ("sample.hide_limits", sample.hide_limits),

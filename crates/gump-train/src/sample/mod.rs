@@ -33,7 +33,7 @@ pub(crate) use self::targets::{ControlTarget, StateTarget, TrajectoryTarget};
 use self::targets::{class_targets, control_targets, light_targets, targets};
 pub(crate) use self::window::Driven;
 use self::window::{Window, choose_window};
-use crate::perturbation;
+use crate::{TrainError, perturbation};
 
 /// Separates the random stream of hiding from those of other choices.
 const HIDDEN: u64 = 1 << 32;
@@ -138,6 +138,51 @@ impl SampleConfig {
             from_reference: 0.0,
             ..Self::default()
         }
+    }
+}
+
+impl SampleConfig {
+    /// Error: [`TrainError::Config`] naming the first number out of its range.
+    pub(crate) fn validate(&self) -> Result<(), TrainError> {
+        // A target is the frame after one that is seen.
+        if self.frames < 2 || self.max_agents == 0 {
+            let (key, least, found) = match self.frames < 2 {
+                true => ("sample.frames", 2, self.frames),
+                false => ("sample.max_agents", 1, self.max_agents),
+            };
+            let reason = format!("{key} must be at least {least}, found {found}");
+            return Err(TrainError::Config { key, reason });
+        }
+        for (key, share) in [
+            ("sample.other_centre", self.other_centre),
+            ("sample.augment", self.augment),
+            ("sample.agent_dropout", self.agent_dropout),
+            ("sample.frame_dropout", self.frame_dropout),
+            ("sample.lateral_perturbation", self.lateral_perturbation),
+            ("sample.surrogate_noise", self.surrogate_noise),
+            ("sample.prompt_dropout", self.prompt_dropout),
+            ("sample.hide_limits", self.hide_limits),
+            ("sample.hide_stop_signs", self.hide_stop_signs),
+            ("sample.hide_lights", self.hide_lights),
+            ("sample.hide_sizes", self.hide_sizes),
+            ("sample.from_reference", self.from_reference),
+        ] {
+            if !(0.0..=1.0).contains(&share) {
+                let reason = format!("{key} must be between 0 and 1, found {share}");
+                return Err(TrainError::Config { key, reason });
+            }
+        }
+        for (key, value) in [
+            ("sample.rotation", self.rotation),
+            ("sample.translation_m", self.translation_m),
+            ("sample.lateral_perturbation_m", self.lateral_perturbation_m),
+        ] {
+            if !value.is_finite() || value < 0.0 {
+                let reason = format!("{key} must be 0 or more, found {value}");
+                return Err(TrainError::Config { key, reason });
+            }
+        }
+        Ok(())
     }
 }
 
