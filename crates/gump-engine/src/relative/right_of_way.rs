@@ -39,6 +39,8 @@ const SLOW_MPS: f64 = 6.0;
 const STARTS_MPS2: (f64, f64) = (1.0, 1.5);
 /// One that gives way stops this far before the place, metres.
 const BEFORE_M: f64 = 1.0;
+/// Who insists has its front nearer to the line than this, metres.
+const AT_LINE_M: f64 = 4.0;
 /// Who stands across the way of another stands at more than this angle to it, radians, with a corner
 /// nearer to the path of its side than this, metres.
 const ACROSS: f64 = 0.5;
@@ -64,8 +66,11 @@ pub struct Course {
     is_inside: bool,
     /// Whether a stop sign applies at the line.
     is_signed: bool,
-    /// Whether the light at the line is red.
+    /// Whether the light at the line is red, and whether there is one.
     is_red: bool,
+    is_lit: bool,
+    /// Whether it goes before those who can still stop, see [`Self::insist`].
+    insists: bool,
     now: Shown,
 }
 
@@ -166,6 +171,8 @@ fn course(streets: &MapGraph, lights: &Lights, now: &Shown, way: &[&Lane], at: f
         is_signed: line
             .is_some_and(|(_, before, lane)| has_sign(streets, before) || has_sign(streets, lane)),
         is_red: line.is_some_and(|(_, _, lane)| lights.colour(lane.id) == Some(LightState::Red)),
+        is_lit: line.is_some_and(|(_, _, lane)| lights.colour(lane.id).is_some()),
+        insists: false,
         now: *now,
     }
 }
@@ -219,6 +226,14 @@ impl Course {
         self.now.velocity().length()
     }
 
+    /// It has waited at a junction for so long that it goes before those who can still stop, if it is at
+    /// the line and no light rules there: streams that never end would hold it for ever.
+    pub(super) fn insist(&mut self) {
+        let front = self.now.body.length / 2.0;
+        let is_at_line = |line: f64| line - front < AT_LINE_M;
+        self.insists = !self.is_lit && self.line_m.is_some_and(is_at_line);
+    }
+
     /// The greatest speed if this one has to let another pass.
     fn limit(&self, other: &Self) -> Option<f64> {
         let stays_out = !other.is_inside && (other.is_red || (self.is_signed && other.stops()));
@@ -268,7 +283,7 @@ impl Course {
     /// pass. `is_bound` says that it is too late for that.
     fn expects(&self, other: &Self, is_bound: bool) -> bool {
         let waits_for_it = turns_left_before(other, self) && !is_bound;
-        other.speed() >= MOVES_MPS || (other.is_inside && !waits_for_it)
+        other.speed() >= MOVES_MPS || other.insists || (other.is_inside && !waits_for_it)
     }
 
     /// The greatest speed before another that stands in a junction across its way: it stops where the
@@ -303,6 +318,9 @@ impl Course {
 
     /// Whether it has to let another pass that it meets; `is_later` says who comes there first.
     fn gives_way(&self, other: &Self, is_later: bool) -> bool {
+        if !self.is_inside && !other.is_inside && self.insists != other.insists {
+            return other.insists;
+        }
         let turns_left = turns_left_before(self, other);
         if turns_left != turns_left_before(other, self) {
             return turns_left;
@@ -579,6 +597,34 @@ mod tests {
         let (_, other) = speeds(&map, &none, car((49.0, 2.9), 0.8, 0.0), at_the_line);
         // It may start, but not up to the bumper.
         assert!(other < 5.0, "{other}");
+    }
+
+    #[test]
+    fn who_insists_goes_before_those_who_can_still_stop() {
+        let map = crossing(&[]);
+        // One waits at its line, another comes from the south.
+        let meet = |x: f64, (y, speed): (f64, f64), lights: &Lights| {
+            let south = courses(&map, lights, &car((52.0, y), SOUTH, speed), None);
+            let mut west = courses(&map, lights, &car((x, 0.0), WEST, 0.0), None);
+            west.truncate(1);
+            west.iter_mut().for_each(Course::insist);
+            let yields =
+                |own: &[Course], other: &[Course]| yielding_speed(own, &std::iter::once(other));
+            (yields(&west, &south), yields(&south, &west))
+        };
+        let none = Lights::default();
+        let (west, south) = meet(37.5, (-30.0, 9.0), &none);
+        assert!(west.is_infinite() && south < 9.0, "{west} {south}");
+        // The other is in the junction; it is not at its line; a light rules.
+        let (west, south) = meet(37.5, (-8.0, 3.0), &none);
+        assert!(west.is_finite() && south.is_infinite(), "{west} {south}");
+        let (west, south) = meet(30.0, (-20.0, 9.0), &none);
+        assert!(south.is_infinite(), "{west} {south}");
+        let lights = Lights {
+            by_lane: vec![(LaneId(2), LightState::Green, None)],
+        };
+        let (west, south) = meet(37.5, (-30.0, 9.0), &lights);
+        assert!(west < 1.0 && south.is_infinite(), "{west} {south}");
     }
 
     #[test]

@@ -36,7 +36,7 @@ const RIGHT: f64 = 0.52;
 const TURNS_AT_RED: f64 = 2.0;
 /// Braking for a light begins where this deceleration is sufficient, metres per second squared; it never
 /// exceeds [`HARDEST_MPS2`].
-const GENTLY: f64 = 4.0;
+pub(super) const GENTLY: f64 = 4.0;
 /// Who can stop for a yellow light with this does, metres per second squared: the others pass before it is
 /// red.
 const FOR_YELLOW_MPS2: f64 = 3.0;
@@ -272,6 +272,8 @@ pub(super) struct Known<'r> {
     pub(super) is_parked: bool,
     /// It lets everybody pass.
     pub(super) stands_back: bool,
+    /// It has waited for so long that others let it pass.
+    pub(super) insists: bool,
     /// Where it means to go.
     pub(super) route: Option<&'r Route>,
     /// The way into a driveway that it takes.
@@ -300,7 +302,13 @@ impl<'l> Shut<'l> {
         let ways = |i: usize| match agents[i].body.kind {
             AgentKind::Vehicle | AgentKind::Bicycle if comes(i) => match known[i].turns_in {
                 Some(way) => vec![course_in(way, colours, &agents[i])],
-                None => courses(map, colours, &agents[i], known[i].route),
+                None => {
+                    let mut ways = courses(map, colours, &agents[i], known[i].route);
+                    if known[i].insists {
+                        ways.iter_mut().for_each(Course::insist);
+                    }
+                    ways
+                }
             },
             _ => Vec::new(),
         };

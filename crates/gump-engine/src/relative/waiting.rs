@@ -27,9 +27,11 @@ use std::f64::consts::FRAC_PI_2;
 
 use gump_geometry::{DVec2, angle_difference, wrap_angle};
 use gump_model::relative::route::Route;
+use gump_model::steps::TOKEN_DT;
 use gump_scene::{Agent, AgentKind, Lane, LaneAhead, Light, LightState, MapGraph, lanes_ahead};
 
 use crate::relative::approach::has_sign;
+use crate::relative::rules::GENTLY;
 
 // Chosen by hand when the rule was made (decision 26). Result 23 varies how long an agent has stood
 // and how often it is redrawn, but none of these.
@@ -56,12 +58,14 @@ const USUAL: Room = Room {
     ahead_m: 5.0,
     beside_m: 0.3,
     returns: true,
+    insists: false,
 };
 /// The room that suffices for agents that hold each other.
 const TIGHT: Room = Room {
     ahead_m: 2.0,
     beside_m: 0.1,
     returns: false,
+    insists: false,
 };
 /// Crossing traffic within this time is let pass, seconds, ...
 const GAP_S: f64 = 4.0;
@@ -69,6 +73,9 @@ const GAP_S: f64 = 4.0;
 const NEAR_PATH_M: f64 = 1.5;
 /// ... and moves faster than this, metres per second.
 const MOVES: f64 = 0.5;
+/// Who has waited for so long beyond its patience insists, seconds: crossing vehicles that can still stop
+/// before it do not hold it any more. Streams that never end would.
+pub(super) const INSISTS_S: f64 = 5.0;
 /// In a junction patience is at most this, seconds, longer than a benchmark of 8 s shows: who stands
 /// there stands in the way. Vehicles that hold each other there squeeze past at once.
 const INSIDE_S: f64 = 9.0;
@@ -120,6 +127,8 @@ struct Room {
     beside_m: f64,
     /// Whether the path to the lane's centre is included.
     returns: bool,
+    /// Whether crossing vehicles that can still stop are left out.
+    insists: bool,
 }
 
 /// What those may do who have stood for longer than their patience, by index.
@@ -168,14 +177,16 @@ pub(super) fn released(
         if reached.is_empty() {
             continue;
         }
-        let is_held = |room: &Room| {
+        let insists = agents[i].waited_s > agents[i].patience_s + INSISTS_S;
+        let is_held = |room: Room| {
+            let room = Room { insists, ..room };
             let holding = |&j: &usize| {
                 let stays = waits(&j);
-                j != i && holds(&reached, agent, &agents[j].agent, stays, room)
+                j != i && holds(&reached, agent, &agents[j].agent, stays, &room)
             };
             (0..agents.len()).filter(holding).collect::<Vec<_>>()
         };
-        let holding = is_held(&USUAL);
+        let holding = is_held(USUAL);
         people.extend(holding.iter().copied().filter(|&j| walks(j) && waits(&j)));
         // Vehicles that have held each other for long squeeze past.
         let turn =
@@ -183,7 +194,7 @@ pub(super) fn released(
         let crosses = |j: &usize| waits(j) && !walks(*j) && turn(&agents[*j].agent).abs() > CROSSES;
         let squeezes = || {
             let is_long = inside[i] || agents[i].waited_s > 2.0 * agents[i].patience_s;
-            is_long && holding.iter().all(crosses) && is_held(&TIGHT).is_empty()
+            is_long && holding.iter().all(crosses) && is_held(TIGHT).is_empty()
         };
         if !is_shut(&reached, lights, agent) && (holding.is_empty() || squeezes()) {
             free.push((i, reached));
@@ -514,7 +525,12 @@ fn holds(
         return false;
     }
     let steps = (GAP_S * 2.0) as usize;
-    (1..=steps).any(|k| is_ahead(at + velocity * (0.5 * k as f64), beside, LOOK_M))
+    let mut times = (1..=steps).map(|k| 0.5 * k as f64);
+    let meets_s = times.find(|time_s| is_ahead(at + velocity * *time_s, beside, LOOK_M));
+    let speed = other.state.speed();
+    let stops_m = speed * speed / (2.0 * GENTLY) + speed * TOKEN_DT + other.length / 2.0;
+    let can_stop = |time_s: f64| other.kind == AgentKind::Vehicle && time_s * speed > stops_m;
+    meets_s.is_some_and(|time_s| !(room.insists && can_stop(time_s)))
 }
 
 #[cfg(test)]
@@ -583,6 +599,21 @@ mod tests {
         // It has passed, or does not move.
         assert_eq!(free(&crossing(20.0, 8.0), &waited), [0]);
         assert_eq!(free(&crossing(-20.0, 0.0), &waited), [0]);
+    }
+
+    #[test]
+    fn who_insists_is_not_held_by_those_who_can_still_stop() {
+        let lanes = "lane 1: 0,0 30,0 next 2\nlane 2: 30,0 60,0\nlane 3: 45,-60 45,60\n";
+        let crossing = |y: f64| {
+            scenario(&format!(
+                "{lanes}ego vehicle 0: 26,0\n\
+                 agent vehicle 1: 45,{y} heading 1.5708 velocity 0,8"
+            ))
+        };
+        let (far, near) = (crossing(-25.0), crossing(-6.0));
+        assert!(free(&far, &[(0, 9.0)]).is_empty());
+        assert_eq!(free(&far, &[(0, 9.5)]), [0]);
+        assert!(free(&near, &[(0, 9.5)]).is_empty());
     }
 
     #[test]

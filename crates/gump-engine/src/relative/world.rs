@@ -41,7 +41,7 @@ use crate::relative::rules::{
 };
 use crate::relative::seen::{FrameIndex, ObservedAgent, add_presents};
 use crate::relative::turning_in::TakesWay;
-use crate::relative::waiting::{Standing, has_room_behind, released};
+use crate::relative::waiting::{INSISTS_S, Standing, has_room_behind, released};
 use crate::sampling::{Routes, SamplingConfig};
 
 pub use live::LiveFuture;
@@ -67,6 +67,8 @@ const PATIENCE_S: [f64; 2] = [9.0, 27.0];
 /// A slower agent loses its patience, too, metres per second: who stands in another's way creeps by
 /// centimetres now and then, and waits no less.
 const CREEPS: f64 = 0.5;
+/// Who goes on and stops again within this has still waited, metres: it came up to the line.
+const NO_FARTHER_M: f64 = 5.0;
 /// The speed of a restarted agent, metres per second. With 2 m/s vehicles start more often than in the
 /// log (result 23).
 const START: f64 = 1.01;
@@ -83,6 +85,10 @@ const WAITS_BACK: usize = 14;
 /// Who goes on and stops again within so many steps has still waited for ten seconds: in a junction it
 /// goes on at once, where it would creep through two phases of the lights. Chosen by hand (decision 35).
 const GOES_ON: usize = 8;
+/// Who insists at a junction without lights goes before those who can still stop, for so many steps, and,
+/// if it has not gone by then, again after so many. Chosen by hand.
+const INSISTS: usize = 8;
+const AGAIN: usize = 16;
 /// An agent that was faster than this is not parked, metres per second: more than the jitter of
 /// recorded boxes. Chosen by hand (decision 26).
 const DRIVES: f64 = 2.0;
@@ -386,8 +392,10 @@ struct Member {
     seen: ObservedAgent,
     /// Time that it has stood, seconds, as far as it was observed.
     waited: f64,
-    /// Time for which it has been slower than [`CREEPS`], seconds.
+    /// Time for which it has been slower than [`CREEPS`], seconds, and where it was so first: who goes on
+    /// a little has still waited.
     idle: f64,
+    idle_at: DVec2,
     /// Whether it was faster than [`DRIVES`] in a frame since.
     has_driven: bool,
     /// Whether it stands in a lane, or rolls slowly, although nothing holds it.
@@ -397,6 +405,8 @@ struct Member {
     /// Steps for which it does not wait again where it could go: another has backed up for it, or it has
     /// just begun to.
     let_pass: usize,
+    /// Steps for which others let it pass, because it has waited for long.
+    insists: usize,
     /// Where it means to go.
     intent: Intent,
 }
@@ -676,9 +686,7 @@ impl Future {
 
     /// Time after which an agent that stands although nothing holds it goes on, seconds.
     fn patience_s(&self, member: &Member) -> f64 {
-        let stream = self.seed.fork(PATIENCE).fork(member.agent.id.0 as u64);
-        let [least, most] = PATIENCE_S;
-        least + (most - least) * uniform(stream)
+        patience_s(self.seed, member.agent.id)
     }
 
     /// Limits for how long agents are shown to the network as standing. One that is driven from
@@ -693,6 +701,10 @@ impl Future {
             member.could_go = false;
             member.backing = member.backing.saturating_sub(1);
             member.let_pass = member.let_pass.saturating_sub(1);
+            member.insists = match is_due(member.idle, patience_s(self.seed, member.agent.id)) {
+                true => INSISTS,
+                false => member.insists.saturating_sub(1),
+            };
             is_one_idle |= member.idle_s() > PATIENCE_S[0];
             let is_long = driven != Some(member.agent.id)
                 && member.waited > WAITED_S
@@ -827,6 +839,7 @@ impl Future {
             is_unheeded: unheeded == Some(i),
             is_parked: member.waited > PATIENCE_S[0] && !member.has_driven,
             stands_back: member.backing > 0,
+            insists: member.insists > 0 && driven != Some(i),
             route: member.intent.route(),
             turns_in: turns_in(member),
         });
@@ -1007,10 +1020,12 @@ impl Member {
             seen: ObservedAgent::first(engine, body(agent), state.pose, state.velocity),
             waited: 0.0,
             idle: 0.0,
+            idle_at: state.pose.position,
             has_driven: state.speed() > DRIVES,
             could_go: false,
             backing: 0,
             let_pass: 0,
+            insists: 0,
             intent: Intent::default(),
         }
     }
@@ -1048,7 +1063,8 @@ impl Member {
             (_, true) => PATIENCE_S[0] + 2.0 * TOKEN_DT,
             _ => 0.0,
         };
-        self.idle.max(least)
+        let idle = if stands { self.idle } else { 0.0 };
+        idle.max(least)
     }
 
     /// What a history tells that is longer than what the network sees of it: whether the agent drove
@@ -1074,16 +1090,37 @@ impl Member {
             true => self.waited + TOKEN_DT,
             false => 0.0,
         };
-        self.idle = match self.now().velocity().length() < CREEPS {
-            true => self.idle + TOKEN_DT,
-            false => 0.0,
+        let creeps = self.now().velocity().length() < CREEPS;
+        let near_m = match self.agent.kind {
+            AgentKind::Vehicle => NO_FARTHER_M,
+            _ => 0.0,
         };
+        if self.idle == 0.0 || !creeps && self.idle_at.distance(state.pose.position) > near_m {
+            self.idle = 0.0;
+            self.idle_at = state.pose.position;
+        }
+        if creeps {
+            self.idle += TOKEN_DT;
+        }
         self.has_driven |= self.now().velocity().length() > DRIVES;
         self.agent.state = AgentState {
             pose: state.pose,
             velocity: self.now().velocity(),
         };
     }
+}
+
+/// Time after which an agent that stands although nothing holds it goes on, seconds.
+fn patience_s(seed: Seed, agent: AgentId) -> f64 {
+    let stream = seed.fork(PATIENCE).fork(agent.0 as u64);
+    let [least, most] = PATIENCE_S;
+    least + (most - least) * uniform(stream)
+}
+
+/// Whether one that has been idle for so long, seconds, begins to insist in this step.
+fn is_due(idle_s: f64, patience_s: f64) -> bool {
+    let over = ((idle_s - patience_s - INSISTS_S) / TOKEN_DT).floor();
+    over >= 0.0 && (over as usize).is_multiple_of(AGAIN)
 }
 
 /// Whether a vehicle is within `reach` metres of a lane's centre, and aligned with it.
