@@ -47,7 +47,7 @@ use crate::sampling::{Routes, SamplingConfig};
 pub use live::LiveFuture;
 
 /// Radius of the prepared map around the start, metres: 120 m are left around an ego that has gone
-/// [`FOLLOW_M`]. Not tuned.
+/// `FOLLOW_M`. Not tuned.
 pub const MAP_M: f64 = 300.0;
 
 /// Maximum known time since a light changed, seconds: the length of the training scenes.
