@@ -427,6 +427,41 @@ fn a_relative_network_trains_in_stages_and_goes_on_where_it_stopped() {
     }
 }
 
+#[test]
+fn the_weights_of_a_run_can_be_the_mean_of_its_last_stages() {
+    let place = Workplace::new();
+    let averaged = |n: usize| {
+        RELATIVE.replace(
+            "[train]",
+            &format!("[weights]\nmean_of_stages = {n}\n[train]"),
+        )
+    };
+    fs::write(place.path("mean.toml"), averaged(2)).unwrap();
+    place.results("mean.toml", "out");
+    let weights = |path: &str| {
+        let path = place.path(&format!("out/{path}weights.safetensors"));
+        let network = relative::load(&path, &Device::Cpu).unwrap();
+        let all = network.parameters().all();
+        let all = all.map(|(_, var)| var.flatten_all().unwrap().to_vec1::<f32>().unwrap());
+        all.flatten().collect::<Vec<f32>>()
+    };
+    let [mean, first, second] = ["", "stage-1/", "stage-2/"].map(weights);
+    assert_ne!(first, second);
+    for ((mean, first), second) in mean.iter().zip(&first).zip(&second) {
+        // Files have half precision, of 11 bits.
+        let expected = f32::midpoint(*first, *second);
+        assert!(
+            (mean - expected).abs() <= 2e-3 * (first.abs() + second.abs()) + 1e-6,
+            "{mean} of {first} and {second}"
+        );
+    }
+    fs::write(place.path("mean.toml"), averaged(3)).unwrap();
+    place.fails("mean.toml", 2, &["mean_of_stages is 3", "1 to 2"]);
+    let stage = RELATIVE.replace("[[stage]]\n", "[[stage]]\nweights = {mean_of_stages = 2}\n");
+    fs::write(place.path("mean.toml"), stage).unwrap();
+    place.fails("mean.toml", 2, &["unknown key weights"]);
+}
+
 #[cfg(not(feature = "mpi"))]
 #[test]
 fn processes_that_know_nothing_of_each_other_are_refused() {

@@ -3,6 +3,7 @@
 //!
 //! Shapes: `N` nodes, `M` pieces of the map, `E` edges, `C` width, `F` features per edge, `H` heads.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use candle_core::{Device, Result, Tensor};
@@ -238,6 +239,39 @@ impl RelativeNetwork {
             }
         }
         Ok(deeper)
+    }
+
+    /// The network whose weights are the means of those of several of one shape. If they continue each
+    /// other, or began with the same weights, it is often better than any of them
+    /// ([Izmailov et al. 2018](https://arxiv.org/abs/1803.05407)).
+    ///
+    /// # Errors
+    /// [`ModelError::Config`] if there is none, or if their shapes differ.
+    pub fn mean(networks: &[Self]) -> std::result::Result<Self, ModelError> {
+        let fail = |reason: &str| {
+            let reason = reason.to_owned();
+            let key = "relative";
+            Err(ModelError::Config { key, reason })
+        };
+        let Some((first, rest)) = networks.split_first() else {
+            return fail("a mean of no networks");
+        };
+        if rest.iter().any(|other| other.config != first.config) {
+            return fail("a mean of networks of several shapes");
+        }
+        let mut sums = BTreeMap::new();
+        for (name, var) in first.parameters.all() {
+            let mut sum = var.as_tensor().clone();
+            for other in rest {
+                match other.parameters.find(name) {
+                    Some(own) => sum = (sum + own.as_tensor())?,
+                    None => return fail("a mean of networks of several shapes"),
+                }
+            }
+            sums.insert(name.to_owned(), (sum / networks.len() as f64)?);
+        }
+        let device = first.parameters.device();
+        Self::build(first.config.clone(), Parameters::loaded(sums, device))
     }
 
     /// The shape it was built from.

@@ -67,6 +67,24 @@ fn rolled_out_it_computes_what_it_computes_in_training() {
     }
 }
 
+#[test]
+fn a_mean_lies_between_networks_of_one_shape() {
+    let [one, other] =
+        [4, 5].map(|seed| RelativeNetwork::random(config(), Seed(seed), &Device::Cpu).unwrap());
+    let numbers = |network: &RelativeNetwork| {
+        let var = network.parameters().find("layers.0.out.weight").unwrap();
+        var.flatten_all().unwrap().to_vec1::<f32>().unwrap()
+    };
+    let (a, b) = (numbers(&one), numbers(&other));
+    let deeper = one.deepened(4, Seed(9)).unwrap();
+    let mean = RelativeNetwork::mean(&[one, other]).unwrap();
+    for ((a, b), mean) in a.iter().zip(&b).zip(numbers(&mean)) {
+        assert!((f32::midpoint(*a, *b) - mean).abs() < 1e-6);
+    }
+    assert!(RelativeNetwork::mean(&[]).is_err());
+    assert!(RelativeNetwork::mean(&[mean, deeper]).is_err());
+}
+
 /// Added layers change nothing at first, and learn.
 #[test]
 fn a_deeper_network_goes_on_from_what_it_said() {

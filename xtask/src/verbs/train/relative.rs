@@ -42,6 +42,22 @@ struct Config {
     relative: RelativeConfig,
     #[serde(default)]
     train: RelativeTrainConfig,
+    #[serde(default)]
+    weights: Weights,
+}
+
+/// What the weights of a run are.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Weights {
+    /// The mean of those of so many stages, the last ones.
+    mean_of_stages: usize,
+}
+
+impl Default for Weights {
+    fn default() -> Self {
+        Self { mean_of_stages: 1 }
+    }
 }
 
 /// Whether the arguments request this network: by name, or by the initial weights.
@@ -67,6 +83,14 @@ pub(super) fn execute(args: &Args, run: &mut Run, processes: &Processes) -> anyh
         return Err(WrongArguments(wrong).into());
     }
     let stages = args.stages_of(&known_keys()?, |table| config(args, table))?;
+    let averaged = stages[0].config.weights.mean_of_stages;
+    if averaged == 0 || averaged > stages.len() {
+        let wrong = format!(
+            "weights.mean_of_stages is {averaged}, expected 1 to {}, the number of stages",
+            stages.len()
+        );
+        return Err(WrongArguments(wrong).into());
+    }
     let was_begun = |stage: &Stage<Config>| run.path(&stage.files.path(CHECKPOINT)).is_file();
     let mut resume = args.resume;
     let first = match args.resume {
@@ -83,7 +107,14 @@ pub(super) fn execute(args: &Args, run: &mut Run, processes: &Processes) -> anyh
     }
     let weights = run.path(WEIGHTS);
     if let Some(network) = network.filter(|_| stages.len() > 1) {
-        relative::save(&network, &weights, StorageType::Half)?;
+        let mut last = vec![network];
+        for stage in stages.iter().rev().skip(1).take(averaged - 1) {
+            last.push(relative::load(
+                &run.path(&stage.files.path(WEIGHTS)),
+                run.device(),
+            )?);
+        }
+        relative::save(&RelativeNetwork::mean(&last)?, &weights, StorageType::Half)?;
     }
     run.result("resumed", args.resume)?;
     run.result("weights", weights)
@@ -235,6 +266,8 @@ fn known_keys() -> anyhow::Result<Table> {
     known.insert("model".into(), NAME.into());
     let shape = Table::try_from(RelativeConfig::default())?;
     known.insert("relative".into(), shape.into());
+    let weights = Table::from_iter([("mean_of_stages".to_owned(), 1.into())]);
+    known.insert("weights".into(), weights.into());
     let realism = RelativeRewards {
         kl_target: Some(0.0),
         kl_bound: Some(0.0),

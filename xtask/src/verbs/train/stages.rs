@@ -90,7 +90,9 @@ impl Args {
             return Err(WrongArguments(wrong.into()).into());
         }
         let mut known = known.clone();
-        known.remove("model");
+        for of_the_run in ["model", "relative", "weights"] {
+            known.remove(of_the_run);
+        }
         known.insert("data".into(), "".into());
         known.insert("stop_at".into(), 1.into());
         let stages = stages.into_iter().enumerate().map(|(i, stage)| {
