@@ -310,7 +310,8 @@ fn the_recorded_stages_of_the_relative_network_can_be_run() {
     };
     on_these("relative.toml");
     place.results("relative.toml --steps 1", "out");
-    for stage in 1..=6 {
+    let recorded = fs::read_to_string(place.path("relative.toml")).unwrap();
+    for stage in 1..=recorded.matches("[[stage]]").count() {
         let weights = place.path(&format!("out/stage-{stage}/weights.safetensors"));
         let network = relative::load(&weights, &Device::Cpu).unwrap();
         assert_eq!(network.config(), shipped.config());
