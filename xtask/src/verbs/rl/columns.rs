@@ -1,5 +1,6 @@
 //! The report of an evaluation of policies, from the entries of its store alone.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::path::PathBuf;
@@ -354,11 +355,11 @@ fn csv(tested: &Tested, entries: &[Entry<Driven>]) -> anyhow::Result<String> {
             writeln!(
                 csv,
                 "{},{},{},{},{},{},{},{},{},{},{},{}",
-                policy.policy,
-                policy.train_world.as_deref().unwrap_or(""),
-                tested.worlds[one.world],
-                policy.file.display(),
-                entry.id,
+                cell(&policy.policy),
+                cell(policy.train_world.as_deref().unwrap_or("")),
+                cell(&tested.worlds[one.world]),
+                cell(&policy.file.display().to_string()),
+                cell(&entry.id),
                 one.repeat,
                 u8::from(one.collided),
                 u8::from(one.drive(0).at_fault),
@@ -372,9 +373,29 @@ fn csv(tested: &Tested, entries: &[Entry<Driven>]) -> anyhow::Result<String> {
     Ok(csv)
 }
 
+/// A text as a cell, in quotation marks where RFC 4180 asks for them.
+fn cell(text: &str) -> Cow<'_, str> {
+    match text.contains([',', '"', '\n', '\r']) {
+        true => format!("\"{}\"", text.replace('"', "\"\"")).into(),
+        false => text.into(),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn names_with_commas_stay_in_their_column() {
+        let trained = policy("sac", Some("model:w, yielding learned"));
+        let text = csv(&tested(vec![trained], &[]), &entries(1, 3)).unwrap();
+        let row = text.lines().nth(1).unwrap();
+        assert_eq!(
+            row,
+            "sac,\"model:w, yielding learned\",idm,sac,0,0,0,0,0,31,1,0.75"
+        );
+        assert_eq!(cell("a \"b\""), "\"a \"\"b\"\"\"");
+    }
 
     fn policy(policy: &str, train_world: Option<&str>) -> Policy {
         Policy {
