@@ -258,6 +258,8 @@ pub(super) struct Shut<'l> {
     entries: Vec<Option<StopLine>>,
     /// Where agents mean to go.
     routes: Vec<Option<&'l Route>>,
+    /// The ways into driveways that they take.
+    turns_in: Vec<Option<TakesWay<'l>>>,
     /// The greatest speed for those that have the right of way, for stop signs and for bends, by agent,
     /// metres per second.
     most: Vec<f64>,
@@ -330,18 +332,20 @@ impl<'l> Shut<'l> {
             lights: lights.collect(),
             entries: (0..agents.len()).map(entry).collect(),
             routes: known.iter().map(|known| known.route).collect(),
+            turns_in: known.iter().map(|known| known.turns_in).collect(),
             most: (0..agents.len()).map(most).collect(),
         }
     }
 
-    /// Whether an agent crosses one with this move, takes another's right of way or is too fast for a
-    /// stop sign or a bend.
+    /// Whether an agent crosses one with this move, takes another's right of way, is too fast for a stop
+    /// sign or a bend, or strays from its way into a driveway.
     pub(super) fn forbids(&self, agents: &[Shown], i: usize, step: Pose) -> bool {
         let now = &agents[i];
         let entry = self.entries[i].as_ref();
         entry.is_some_and(|line| line.is_crossed(now, step, GENTLY))
             || runs_light(now, &self.crossed(now, i, step))
             || step.position.length() / TOKEN_DT > self.at_most(now, i)
+            || self.turns_in[i].is_some_and(|way| way.strays(now, step))
     }
 
     /// The greatest speed of an agent for others, signs and bends, metres per second: it brakes no harder
@@ -680,6 +684,7 @@ mod tests {
             lights: lights.to_vec(),
             entries: vec![None],
             routes: vec![None],
+            turns_in: vec![None],
             most: vec![f64::INFINITY],
         }
     }

@@ -1,5 +1,6 @@
 //! Vehicles that turn into driveways.
 
+use gump_geometry::Pose;
 use gump_model::relative::driveway::{Driveways, WayIn};
 use gump_model::relative::graph::Shown;
 use gump_scene::{Agent, AgentKind, BendLimits, Lane, LaneId, MapGraph, Seed, bend_speed};
@@ -19,6 +20,8 @@ const STANDS_MPS: f64 = 0.5;
 /// this angle, radians; it has lost it beyond the second numbers.
 const ON_WAY: (f64, f64) = (1.5, 0.5);
 const LOST: (f64, f64) = (3.0, 1.2);
+/// A move in the turn is drawn again if it ends farther from its way than this, metres, and than it began.
+const STRAYS_M: f64 = 0.3;
 /// It decides this far before the turn at most, metres, and not if it had to brake harder than this for
 /// it, m/s², down to this speed, metres per second.
 const DECIDES_M: f64 = 16.0;
@@ -63,6 +66,13 @@ impl<'a> TakesWay<'a> {
     /// Whether the vehicle is about to leave the street, or has.
     pub(super) fn leaves_street(&self, now: &Shown) -> bool {
         self.at(now) > self.way.turns_off_m - LEAVES_M
+    }
+
+    /// Whether it gets farther from its way with this move, where that leaves the street.
+    pub(super) fn strays(&self, now: &Shown, step: Pose) -> bool {
+        let off = |pose: Pose| self.lane.centerline.project(pose.position).distance;
+        let after = off(now.pose * step);
+        self.leaves_street(now) && after > STRAYS_M && after > off(now.pose)
     }
 
     /// Whether the vehicle is no longer on it.

@@ -139,7 +139,7 @@ fn towards_the_edge(place: DVec2) -> Scenario {
     let text = format!(
         "lane 1: {} {} {} speed 13
          edge: {} {}
-         ego vehicle 0: {} heading -0.08 velocity 11.96,-0.96 size 4.8,2",
+         ego vehicle 0: {} heading -0.12 velocity 11.91,-1.44 size 4.8,2",
         at(-100.0, 0.0),
         at(0.0, 0.0),
         at(250.0, 0.0),
