@@ -139,9 +139,7 @@ impl SampleConfig {
             ..Self::default()
         }
     }
-}
 
-impl SampleConfig {
     /// Error: [`TrainError::Config`] naming the first number out of its range.
     pub(crate) fn validate(&self) -> Result<(), TrainError> {
         // A target is the frame after one that is seen.
