@@ -2,7 +2,7 @@
 //!
 //! What lives here: products of matrices over checked slices ([`gemm`]), the kernels among which one
 //! is chosen for the processor at run time ([`Kernel`], [`Choice`]), weights packed once for many
-//! products ([`panels`]), sums in a fixed order ([`rows`]), and the row-wise parts of layers that
+//! products ([`panels`]), attention in bfloat16 ([`half_pages`]), sums in a fixed order ([`rows`]), and the row-wise parts of layers that
 //! training and inference share ([`gelu`], [`gru`], [`norm`], [`edge_attention`]). What does not:
 //! tensors, gradients and layers, which are `gump-nn`'s. All `unsafe` of the workspace is in `gemm`
 //! and `kernels`.
@@ -26,6 +26,7 @@ mod error;
 pub mod gelu;
 pub mod gemm;
 pub mod gru;
+pub mod half_pages;
 mod kernels;
 pub mod norm;
 mod operands;

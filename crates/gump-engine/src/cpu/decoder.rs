@@ -129,6 +129,7 @@ impl Decoder {
             buffers: [states, gates, input, logits],
             products,
             draws,
+            ..
         } = room;
         // The state before the first step is the hidden vector in every layer.
         states.clear();

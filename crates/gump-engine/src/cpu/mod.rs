@@ -26,7 +26,7 @@ use rayon::prelude::*;
 use self::decoder::Decoder;
 use self::embed::{Embedder, Ground};
 pub use self::kv_cache::KvCache;
-use self::kv_cache::{Heads, Pages, attend};
+use self::kv_cache::{AttentionRoom, Heads, Pages, attend};
 pub use self::successor::Successor;
 use gump_kernels::gelu::gelu_row;
 use gump_kernels::panels::{Panels, Precision, Scratch};
@@ -103,10 +103,7 @@ impl Engine {
         let weights = WeightReader { network, precision };
         Ok(Self {
             width: c,
-            heads: Heads {
-                n: config.heads,
-                d: c / config.heads,
-            },
+            heads: Heads::new(config.heads, c / config.heads, precision),
             embedder: Embedder::new(&weights)?,
             layers: (0..config.layers)
                 .map(|i| Layer::new(&weights, i, c))
@@ -391,13 +388,13 @@ impl Engine {
         room: &mut Workspace,
     ) {
         let c = self.width;
-        let [normal, q, attended, scores] = &mut room.buffers;
+        let [normal, q, attended, _] = &mut room.buffers;
         normal.resize(x.len(), 0.0);
         q.resize(x.len(), 0.0);
         attended.resize(x.len(), 0.0);
         attention.norm.apply(x, normal);
         attention.query.apply_to_few(normal, q, &mut room.products);
-        let scale = 1.0 / (self.heads.d as f32).sqrt();
+        let scale = 1.0 / (self.heads.channels() as f32).sqrt();
         q.iter_mut().for_each(|q| *q *= scale);
         let mut first = 0;
         for group in rows.chunk_by(|a, b| a.0 == b.0) {
@@ -405,11 +402,7 @@ impl Engine {
             let at = first * c..(first + group.len()) * c;
             let (q, out) = (&q[at.clone()], &mut attended[at]);
             let visible = |i: usize| keys(&group[i]).1;
-            match group.len() {
-                1 => attend::<1>(self.heads, pages, q, visible, out, scores),
-                2..=4 => attend::<4>(self.heads, pages, q, visible, out, scores),
-                _ => attend::<8>(self.heads, pages, q, visible, out, scores),
-            }
+            attend(self.heads, pages, q, visible, out, &mut room.attention);
             first += group.len();
         }
         attention
@@ -441,7 +434,7 @@ fn add_scaled(x: &mut [f32], y: &[f32], scale: f32) {
 
 /// Hands every job its new keys and values in layer `l`.
 fn write_pages(heads: Heads, l: usize, jobs: &mut [Job<'_>], starts: &[usize], kv: &[f32]) {
-    let c = heads.n * heads.d;
+    let c = heads.width();
     let mut rest = kv;
     let mut parts = Vec::with_capacity(jobs.len());
     for (job, start) in jobs.iter_mut().zip(starts) {
@@ -470,6 +463,7 @@ fn chunk_rows(rows: usize) -> usize {
 pub(crate) struct Workspace {
     buffers: [Vec<f32>; 4],
     products: Scratch,
+    attention: AttentionRoom,
     /// Candidates of a draw.
     draws: Candidates,
 }

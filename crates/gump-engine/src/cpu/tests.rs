@@ -96,9 +96,13 @@ fn weights_without_end_are_refused_by_name() {
 
 #[test]
 fn a_context_changes_no_bit() {
+    Precision::ALL.into_iter().for_each(check_contexts);
+}
+
+fn check_contexts(precision: Precision) {
     let (network, scenario) = (network(), scenario());
     let (slots, memory) = (slots(&scenario), memory(&network, &scenario));
-    let engine = Engine::new(&network, Precision::F32).unwrap();
+    let engine = Engine::new(&network, precision).unwrap();
     let memory = engine.remember(&memory).unwrap();
     let whole = all(&engine, &memory, &slots, &mut KvCache::default());
     let mut kv_cache = KvCache::default();

@@ -17,6 +17,8 @@ use rayon::prelude::*;
 use crate::gemm::{Mat, MatMut, Store, Threads};
 use crate::panels::PANEL;
 
+use super::Pairs;
+
 /// Inner indices packed at a time: a panel of 32 KB stays in the first-level cache.
 const DEPTH: usize = 512;
 
@@ -113,37 +115,11 @@ impl Target<'_> {
     }
 }
 
-/// A cache line of pairs.
-#[derive(Clone, Copy, Debug)]
-#[repr(C, align(64))]
-pub(super) struct Line([u32; 16]);
-
-/// Pairs that begin at a cache line.
-#[derive(Debug, Default)]
-pub(super) struct Pairs(Vec<Line>);
-
-impl Pairs {
-    /// Returns room for `n` pairs, with unspecified contents.
-    pub(super) fn room(&mut self, n: usize) -> &mut [u32] {
-        self.0.resize(n.div_ceil(16), Line([0; 16]));
-        &mut super::flat_mut(&mut self.0)[..n]
-    }
-
-    pub(super) fn all(&self) -> &[u32] {
-        super::flat(&self.0)
-    }
-
-    /// Bytes they take.
-    pub(super) fn bytes(&self) -> usize {
-        size_of_val(&self.0[..])
-    }
-}
-
 thread_local! {
     /// Buffers for packed operands, kept from product to product. A running product takes them out:
     /// while a thread waits for others, it may begin another product.
-    static LEFT: RefCell<Pairs> = const { RefCell::new(Pairs(Vec::new())) };
-    static RIGHT: RefCell<Pairs> = const { RefCell::new(Pairs(Vec::new())) };
+    static LEFT: RefCell<Pairs> = const { RefCell::new(Pairs::none()) };
+    static RIGHT: RefCell<Pairs> = const { RefCell::new(Pairs::none()) };
 }
 
 /// A right matrix, packed once for many products.

@@ -19,12 +19,15 @@ mod avx512_bf16;
 #[cfg(target_arch = "x86_64")]
 mod bf16;
 mod choice;
+#[cfg(target_arch = "x86_64")]
+mod half_attention;
 mod portable;
 mod rounded;
 #[cfg(test)]
 mod tests;
 
 use crate::gemm::{Mat, MatMut, Store, Threads};
+use crate::half_pages::{HalfHeads, HalfPage, Room};
 use crate::panels::PANEL;
 #[cfg(target_arch = "x86_64")]
 use amx::Amx;
@@ -88,6 +91,25 @@ fn unit() -> Option<AnyUnit> {
 /// Whether the chosen kernel multiplies bfloat16 faster than f32.
 pub(crate) fn has_unit() -> bool {
     unit().is_some()
+}
+
+/// As [`crate::half_pages::attend`], whose shapes fit.
+pub(crate) fn attend_half(
+    heads: HalfHeads,
+    pages: &[&HalfPage],
+    q: &[f32],
+    visible: &[usize],
+    out: &mut [f32],
+    room: &mut Room,
+) {
+    match unit().expect("who has such pages has a unit") {
+        #[cfg(target_arch = "x86_64")]
+        AnyUnit::Amx(unit) => half_attention::attend(unit, heads, pages, q, visible, out, room),
+        #[cfg(target_arch = "x86_64")]
+        AnyUnit::Avx512Bf16(unit) => {
+            half_attention::attend(unit, heads, pages, q, visible, out, room);
+        }
+    }
 }
 
 /// A right matrix, rounded to bfloat16 and packed once for many products.
@@ -253,16 +275,39 @@ fn amx_bytes(unit: Amx, rows: &[u8], panel: &[i8]) -> [[i32; PANEL]; BYTE_ROWS] 
     sums
 }
 
-/// The pairs of cache lines.
-#[cfg(target_arch = "x86_64")]
-fn flat(lines: &[bf16::Line]) -> &[u32] {
-    // SAFETY: a line is 16 pairs and nothing else, and the slice is as long as its lines.
-    unsafe { std::slice::from_raw_parts(lines.as_ptr().cast(), 16 * lines.len()) }
-}
+/// A cache line of pairs.
+#[derive(Clone, Copy, Debug)]
+#[repr(C, align(64))]
+struct Line([u32; 16]);
 
-/// As [`flat`], mutable.
-#[cfg(target_arch = "x86_64")]
-fn flat_mut(lines: &mut [bf16::Line]) -> &mut [u32] {
-    // SAFETY: as above; any bits are pairs, and the borrow is unique.
-    unsafe { std::slice::from_raw_parts_mut(lines.as_mut_ptr().cast(), 16 * lines.len()) }
+/// Pairs that begin at a cache line.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Pairs(Vec<Line>);
+
+impl Pairs {
+    /// None yet.
+    const fn none() -> Self {
+        Self(Vec::new())
+    }
+
+    /// Returns room for `n` pairs, with unspecified contents.
+    pub(crate) fn room(&mut self, n: usize) -> &mut [u32] {
+        self.0.resize(n.div_ceil(16), Line([0; 16]));
+        &mut self.all_mut()[..n]
+    }
+
+    pub(crate) fn all(&self) -> &[u32] {
+        // SAFETY: a line is 16 pairs and nothing else, and the slice is as long as its lines.
+        unsafe { std::slice::from_raw_parts(self.0.as_ptr().cast(), 16 * self.0.len()) }
+    }
+
+    pub(crate) fn all_mut(&mut self) -> &mut [u32] {
+        // SAFETY: as above; any bits are pairs, and the borrow is unique.
+        unsafe { std::slice::from_raw_parts_mut(self.0.as_mut_ptr().cast(), 16 * self.0.len()) }
+    }
+
+    /// Bytes they take.
+    pub(crate) fn bytes(&self) -> usize {
+        size_of_val(&self.0[..])
+    }
 }

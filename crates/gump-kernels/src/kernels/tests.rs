@@ -375,3 +375,101 @@ fn extreme_bytes_do_not_saturate() {
     assert_eq!(sums, portable::byte_tile([&all], &panel));
     assert_eq!(sums[0][0], 2 * 255 * 127 - 6 * 255 * 128);
 }
+
+/// Attention in f64, of one row with one head.
+#[cfg(target_arch = "x86_64")]
+fn exact_attention(q: &[f32], keys: &[&[f32]], values: &[&[f32]]) -> Vec<f64> {
+    let number = |x: f32| f64::from(rounded::round(x));
+    let score = |key: &&[f32]| {
+        q.iter()
+            .zip(*key)
+            .map(|(q, k)| number(*q) * number(*k))
+            .sum()
+    };
+    let scores: Vec<f64> = keys.iter().map(score).collect();
+    let weights: Vec<f64> = scores.iter().map(|score| score.exp()).collect();
+    let all: f64 = weights.iter().sum();
+    let channel = |c: usize| {
+        let terms = weights.iter().zip(values).map(|(w, v)| w * number(v[c]));
+        terms.sum::<f64>() / all
+    };
+    (0..q.len()).map(channel).collect()
+}
+
+/// Some channels of all rows.
+#[cfg(target_arch = "x86_64")]
+fn head_of(all: &[f32], c: usize, part: std::ops::Range<usize>) -> Vec<&[f32]> {
+    all.chunks_exact(c).map(|row| &row[part.clone()]).collect()
+}
+
+#[test]
+#[cfg(target_arch = "x86_64")]
+fn attention_over_pages_is_that_of_rounded_numbers() {
+    use crate::half_pages::PAGE;
+    type Way = fn(HalfHeads, &[&HalfPage], &[f32], &[usize], &mut [f32], &mut Room);
+    let mut ways: Vec<(&str, Way)> = Vec::new();
+    match Avx512Bf16::detect() {
+        Some(_) => {
+            ways.push(("avx512-bf16", |heads, pages, q, visible, out, room| {
+                let unit = Avx512Bf16::detect().unwrap();
+                half_attention::attend(unit, heads, pages, q, visible, out, room);
+            }));
+            ways.push(("tiles as told", |heads, pages, q, visible, out, room| {
+                let unit = tiles::Emulated(Avx512Bf16::detect().unwrap());
+                half_attention::attend(unit, heads, pages, q, visible, out, room);
+            }));
+        }
+        None => eprintln!("skipped: this processor has no avx512-bf16"),
+    }
+    match Amx::detect() {
+        Some(_) => ways.push(("amx", |heads, pages, q, visible, out, room| {
+            let unit = Amx::detect().unwrap();
+            half_attention::attend(unit, heads, pages, q, visible, out, room);
+        })),
+        None => eprintln!("skipped: this processor has no amx"),
+    }
+    // An odd number of channels, more than a panel of them, and the sizes of the networks.
+    for (n, d) in [(1, 5), (3, 40), (4, 32), (2, 64)] {
+        let (heads, c, tokens, rows) = (HalfHeads { n, d }, n * d, 75, 41);
+        let (keys, worth) = (values(tokens * c, 1), values(tokens * c, 2));
+        let mut pages = vec![HalfPage::new(heads); tokens.div_ceil(PAGE)];
+        // Written twice: what was there before does not count.
+        for at in (0..tokens).chain(0..tokens) {
+            let own = at * c..(at + 1) * c;
+            pages[at / PAGE].write(heads, at % PAGE, &keys[own.clone()], &worth[own]);
+        }
+        let pages: Vec<&HalfPage> = pages.iter().collect();
+        let q = values(rows * c, 3);
+        let visible: Vec<usize> = (0..rows).map(|r| 1 + (r * 31) % tokens).collect();
+        for (name, way) in &ways {
+            let mut out = vec![9.0; rows * c];
+            let mut room = Room::default();
+            way(heads, &pages, &q, &visible, &mut out, &mut room);
+            for (r, seen) in visible.iter().enumerate() {
+                for h in 0..n {
+                    let part = h * d..(h + 1) * d;
+                    let rows = |all| head_of(all, c, part.clone());
+                    let (keys, worth) = (rows(&keys), rows(&worth));
+                    let expected = exact_attention(rows(&q)[r], &keys[..*seen], &worth[..*seen]);
+                    for (found, expected) in rows(&out)[r].iter().zip(expected) {
+                        // Weights are rounded, too: to 8 bits, of values up to 1.
+                        let off = (f64::from(*found) - expected).abs();
+                        assert!(off < 4e-3, "{name} {n} {d} row {r}: {found} {expected}");
+                    }
+                }
+                // A row alone has the bits it has among others.
+                let mut alone = vec![0.0; c];
+                let of_row = r * c..(r + 1) * c;
+                way(
+                    heads,
+                    &pages,
+                    &q[of_row.clone()],
+                    &[*seen],
+                    &mut alone,
+                    &mut room,
+                );
+                assert_eq!(alone, out[of_row], "{name} {n} {d} row {r}");
+            }
+        }
+    }
+}

@@ -71,6 +71,12 @@ const ALONG: f64 = 0.4;
 const PER_RADIAN: f64 = 4.0;
 const LOOK_M: f64 = 5.0;
 
+/// A vehicle that is the first before a red light drives on up to this, metres from the line to its front,
+/// as fast as this braking allows, metres per second squared, or gains this in a step, metres per second.
+const NEAR_LINE_M: f64 = 3.0;
+const EASES_MPS2: f64 = 0.4;
+const CLOSES_UP_MPS: f64 = 0.4;
+
 /// A vehicle that stands, or moves no farther than this in a step, metres, has this fault, metres per
 /// second, ...
 const CREEPS_M: f64 = 0.15;
@@ -91,6 +97,8 @@ pub(super) struct Road<'a> {
     calm: f64,
     /// The same for vehicles with right of way alone.
     gives_way: f64,
+    /// Least speed of the first vehicle before a red light, metres per second; 0 for all others.
+    least: f64,
     /// Whether it is at a junction.
     turns: bool,
     /// Whether it has nothing to slow down for, or to stand for; determined when it is asked for.
@@ -125,6 +133,7 @@ impl<'a> Road<'a> {
                 false => red,
             },
             gives_way: f64::INFINITY,
+            least: 0.0,
             turns: on.is_some_and(|on| is_at_junction(streets, on)),
             is_free: OnceCell::new(),
             drives,
@@ -140,6 +149,17 @@ impl<'a> Road<'a> {
             gives_way: most,
             ..self
         }
+    }
+
+    /// The same with the least speed before a red light, if there is one on every way ahead. `leads` says
+    /// whether nobody is before the vehicle; it is asked only where that matters.
+    pub(super) fn closing_up(self, now: &Shown, leads: impl FnOnce() -> bool) -> Self {
+        let least = match self.drives {
+            true => least_before_red(self.streets, self.lights, now),
+            false => 0.0,
+        };
+        let least = if least > 0.0 && leads() { least } else { 0.0 };
+        Self { least, ..self }
     }
 
     /// The greatest speed for bends, lights, signs and vehicles with right of way of who need not hurry,
@@ -204,6 +224,11 @@ impl<'a> Road<'a> {
                 .get_or_init(|| self.gives_way.is_infinite() && of_road() && has_room())
         };
         let as_slow = logged.is_some_and(|logged| next > logged - AS_LOGGED_MPS);
+        let is_held = as_slow || self.gives_way.is_finite() || turn > STRAIGHT;
+        let short = match is_held {
+            true => 0.0,
+            false => (self.least.min(speed + CLOSES_UP_MPS) - next).max(0.0),
+        };
         let is_free = || !(as_slow && self.turns) && is_free();
         let slow = match lost > SLOWS_MPS && turn <= STRAIGHT && is_free() {
             true => lost - SLOWS_MPS,
@@ -217,7 +242,7 @@ impl<'a> Road<'a> {
             true => astray(self.streets, now.pose * *step),
             false => 0.0,
         };
-        body + bend + slow + stays + astray
+        body + bend + slow.max(stays).max(short) + astray
     }
 }
 
@@ -238,6 +263,27 @@ fn most_speed(
         |(lane, at, _): (&Lane, f64, f64)| approach_speed(streets, lane, at, limits, &entering);
     let speeds = lanes_under(streets, now.pose).map(of);
     speeds.reduce(f64::max).unwrap_or(f64::INFINITY)
+}
+
+/// The least speed of the first vehicle before a red light, metres per second: that from which it stops
+/// before the line with little braking. 0 near the line, and where a way ahead has no red light.
+fn least_before_red(streets: &MapGraph, lights: &Lights, now: &Shown) -> f64 {
+    let is_red = |(_, colour, _): &(_, LightState, _)| *colour == LightState::Red;
+    if !lights.by_lane.iter().any(is_red) {
+        return 0.0;
+    }
+    let entering = |lane: &Lane, metres: f64| match lights.colour(lane.id) {
+        Some(LightState::Red) => {
+            let room = metres - now.body.length / 2.0 - NEAR_LINE_M;
+            (2.0 * EASES_MPS2 * room.max(0.0)).sqrt()
+        }
+        _ => f64::INFINITY,
+    };
+    let of = |(lane, at, _): (&Lane, f64, f64)| {
+        approach_speed(streets, lane, at, STRAIGHT_ON, &entering)
+    };
+    let most = lanes_under(streets, now.pose).map(of).reduce(f64::max);
+    most.filter(|most| most.is_finite()).unwrap_or(0.0)
 }
 
 fn is_at_junction(streets: &MapGraph, (lane, at): (&Lane, f64)) -> bool {
@@ -396,6 +442,35 @@ mod tests {
         // A right turn goes slowly.
         let right = |next: f64| at((57.5, 50.0), (1.5, next), LightState::Red);
         assert!(right(1.9) == 0.0 && right(3.4) > 0.0);
+    }
+
+    #[test]
+    fn who_is_first_before_a_red_light_drives_up_to_the_line() {
+        let map = streets(
+            "lane 1: 0,0 60,0 next 2,3\nlane 2: 60,0 120,0\nlane 3: 60,0 66,-1 70,-8 70,-40",
+        );
+        let with = |x: f64, (speed, next): (f64, f64), lanes: &[i64], leads, logged| {
+            let now = Shown::first(BODY, Pose::new(x, 0.0, 0.0), dvec2(speed, 0.0));
+            let by_lane = lanes.iter().map(|id| (LaneId(*id), LightState::Red, None));
+            let lights = Lights {
+                by_lane: by_lane.collect(),
+            };
+            let road = Road::ahead_of(&now, false, &map, &lights).closing_up(&now, || leads);
+            road.fault(&now, &Pose::new(next * TOKEN_DT, 0.0, 0.0), logged, || {
+                false
+            })
+        };
+        let first = |x: f64, speeds| with(x, speeds, &[2, 3], true, None);
+        // The front is 13 m from the line, 10 m of which are to be driven: 2.8 m/s are the least.
+        assert!((first(44.75, (0.0, 0.0)) - CLOSES_UP_MPS).abs() < 1e-9);
+        assert!(first(44.75, (4.0, 2.0)) > 0.7 && first(44.75, (4.0, 3.0)) == 0.0);
+        // 3 m from it, and over it.
+        assert!(first(54.8, (0.0, 0.0)) == 0.0 && first(59.0, (0.0, 0.0)) == 0.0);
+        // Another is before it; its log is as slow; one of the ways is open.
+        assert_eq!(with(44.75, (0.0, 0.0), &[2, 3], false, None), 0.0);
+        assert_eq!(with(44.75, (0.0, 0.0), &[2, 3], true, Some(0.1)), 0.0);
+        assert!(with(44.75, (0.0, 0.0), &[2, 3], true, Some(2.0)) > 0.0);
+        assert_eq!(with(44.75, (0.0, 0.0), &[2], true, None), 0.0);
     }
 
     #[test]
