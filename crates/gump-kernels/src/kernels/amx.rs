@@ -16,6 +16,7 @@
 
 use std::arch::asm;
 use std::arch::x86_64::{__cpuid, __cpuid_count, _xgetbv};
+use std::marker::PhantomData;
 use std::sync::OnceLock;
 
 use super::avx512_bf16::{Avx512Bf16, store_rows};
@@ -97,11 +98,12 @@ fn are_tiles_lent() -> bool {
     false
 }
 
-/// Tile configuration of a thread: all eight as 16 rows of 64 bytes; released when dropped.
-struct Tiles(());
+/// Tile configuration of a thread: all eight as 16 rows of 64 bytes; released when dropped, by the same
+/// thread.
+pub(super) struct Tiles(PhantomData<*const ()>);
 
 impl Tiles {
-    fn cut(_: Amx) -> Self {
+    pub(super) fn cut(_: Amx) -> Self {
         #[repr(C, align(64))]
         struct Config {
             palette: u8,
@@ -130,7 +132,57 @@ impl Tiles {
                 options(nostack, readonly)
             );
         }
-        Self(())
+        Self(PhantomData)
+    }
+
+    /// Products of 16 rows of unsigned bytes with a panel of signed ones, summed exactly; as deep as
+    /// whole tiles reach, which is returned too: what is left is another kernel's.
+    ///
+    /// `rows` are `depth` bytes each, one after another; `panel` is `[depth / 4, PANEL, 4]`.
+    ///
+    /// Panics when they are not.
+    pub(super) fn multiply_bytes(
+        &self,
+        rows: &[u8],
+        panel: &[i8],
+    ) -> ([[i32; PANEL]; TILE], usize) {
+        let depth = panel.len() / PANEL;
+        assert!(rows.len() == TILE * depth, "16 rows of {depth} bytes");
+        let steps = depth / TILE_BYTES;
+        let mut sums = [[0i32; PANEL]; TILE];
+        // SAFETY: the value proves that the thread has cut the tiles; a step reads 64 bytes of each of
+        // the 16 rows, `depth` apart, and 16 rows of 128 bytes of the panel, `steps` times, which both
+        // were found to have; what is written is `sums`, 16 rows of 128 bytes.
+        unsafe {
+            asm!(
+                "tilezero tmm0",
+                "tilezero tmm1",
+                "test {steps}, {steps}",
+                "jz 3f",
+                "2:",
+                "tileloadd tmm4, [{rows} + {depth}*1]",
+                "tileloadd tmm6, [{panel} + {of_panel}*1]",
+                "tileloadd tmm7, [{panel} + {of_panel}*1 + 64]",
+                "tdpbusd tmm0, tmm4, tmm6",
+                "tdpbusd tmm1, tmm4, tmm7",
+                "add {rows}, 64",
+                "add {panel}, 2048",
+                "dec {steps}",
+                "jnz 2b",
+                "3:",
+                "tilestored [{sums} + {of_panel}*1], tmm0",
+                "tilestored [{sums} + {of_panel}*1 + 64], tmm1",
+                rows = inout(reg) rows.as_ptr() => _,
+                panel = inout(reg) panel.as_ptr() => _,
+                steps = inout(reg) steps => _,
+                sums = in(reg) sums.as_mut_ptr(),
+                depth = in(reg) depth,
+                of_panel = in(reg) PANEL_BYTES,
+                out("tmm0") _, out("tmm1") _, out("tmm4") _, out("tmm6") _, out("tmm7") _,
+                options(nostack)
+            );
+        }
+        (sums, steps * TILE_BYTES)
     }
 }
 
@@ -230,51 +282,4 @@ unsafe fn bf16_sums(
             options(nostack)
         );
     }
-}
-
-/// Products of 16 rows of unsigned bytes with a panel of signed ones, summed exactly; as deep as
-/// whole tiles reach, which is returned too: what is left is another kernel's.
-///
-/// `rows` are `depth` bytes each, one after another; `panel` is `[depth / 4, PANEL, 4]`.
-///
-/// Panics when they are not.
-pub(super) fn byte_tile(unit: Amx, rows: &[u8], panel: &[i8]) -> ([[i32; PANEL]; TILE], usize) {
-    let depth = panel.len() / PANEL;
-    assert!(rows.len() == TILE * depth, "16 rows of {depth} bytes");
-    let steps = depth / TILE_BYTES;
-    let mut sums = [[0i32; PANEL]; TILE];
-    let _tiles = Tiles::cut(unit);
-    // SAFETY: the value proves the instructions, the tiles are cut; a step reads 64 bytes of each of
-    // the 16 rows, `depth` apart, and 16 rows of 128 bytes of the panel, `steps` times, which both
-    // were found to have; what is written is `sums`, 16 rows of 128 bytes.
-    unsafe {
-        asm!(
-            "tilezero tmm0",
-            "tilezero tmm1",
-            "test {steps}, {steps}",
-            "jz 3f",
-            "2:",
-            "tileloadd tmm4, [{rows} + {depth}*1]",
-            "tileloadd tmm6, [{panel} + {of_panel}*1]",
-            "tileloadd tmm7, [{panel} + {of_panel}*1 + 64]",
-            "tdpbusd tmm0, tmm4, tmm6",
-            "tdpbusd tmm1, tmm4, tmm7",
-            "add {rows}, 64",
-            "add {panel}, 2048",
-            "dec {steps}",
-            "jnz 2b",
-            "3:",
-            "tilestored [{sums} + {of_panel}*1], tmm0",
-            "tilestored [{sums} + {of_panel}*1 + 64], tmm1",
-            rows = inout(reg) rows.as_ptr() => _,
-            panel = inout(reg) panel.as_ptr() => _,
-            steps = inout(reg) steps => _,
-            sums = in(reg) sums.as_mut_ptr(),
-            depth = in(reg) depth,
-            of_panel = in(reg) PANEL_BYTES,
-            out("tmm0") _, out("tmm1") _, out("tmm4") _, out("tmm6") _, out("tmm7") _,
-            options(nostack)
-        );
-    }
-    (sums, steps * TILE_BYTES)
 }

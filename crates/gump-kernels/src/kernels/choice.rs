@@ -280,7 +280,7 @@ fn are_bytes_right(unit: Amx) -> bool {
     let bytes = numbers(16 * DEPTH, |i| i as u8);
     let panel = numbers(DEPTH * PANEL, |i| i as i8);
     let rows: [&[u8]; 16] = std::array::from_fn(|r| &bytes[r * DEPTH..][..DEPTH]);
-    let (sums, done) = super::amx::byte_tile(unit, &bytes, &panel);
+    let (sums, done) = super::amx::Tiles::cut(unit).multiply_bytes(&bytes, &panel);
     done == DEPTH && sums == portable::byte_tile(rows, &panel)
 }
 

@@ -245,34 +245,55 @@ pub(crate) fn byte_tile<const N: usize>(rows: [&[u8]; N], panel: &[i8]) -> [[i32
     portable::byte_tile(rows, panel)
 }
 
-/// Rows that [`byte_tiles`] takes together: those of a tile of AMX.
+/// Rows that [`ByteTiles`] multiply together: those of a tile of AMX.
 pub(crate) const BYTE_ROWS: usize = 16;
 
-/// [`byte_tile`] of 16 rows one after another, where the chosen kernel has tiles of bytes.
-pub(crate) fn byte_tiles(rows: &[u8], panel: &[i8]) -> Option<[[i32; PANEL]; BYTE_ROWS]> {
+/// Tiles of bytes, which the calling thread holds until they are dropped.
+pub(crate) struct ByteTiles {
     #[cfg(target_arch = "x86_64")]
-    if Choice::current().kernel == Kernel::Amx {
-        return Amx::detect().map(|unit| amx_bytes(unit, rows, panel));
-    }
-    let _ = (rows, panel);
-    None
+    tiles: amx::Tiles,
+    #[cfg(not(target_arch = "x86_64"))]
+    never: std::convert::Infallible,
 }
 
-/// Whole tiles by tiles, the rest by vectors.
-#[cfg(target_arch = "x86_64")]
-fn amx_bytes(unit: Amx, rows: &[u8], panel: &[i8]) -> [[i32; PANEL]; BYTE_ROWS] {
-    let depth = panel.len() / PANEL;
-    let (mut sums, done) = amx::byte_tile(unit, rows, panel);
-    if done < depth {
-        let rest = std::array::from_fn(|r| &rows[r * depth + done..(r + 1) * depth]);
-        let rest = byte_tile::<BYTE_ROWS>(rest, &panel[done * PANEL..]);
-        for (sums, rest) in sums.iter_mut().zip(&rest) {
-            for (sum, rest) in sums.iter_mut().zip(rest) {
-                *sum += rest;
-            }
+impl ByteTiles {
+    /// Some where the chosen kernel has them.
+    pub(crate) fn cut() -> Option<Self> {
+        #[cfg(target_arch = "x86_64")]
+        if Choice::current().kernel == Kernel::Amx {
+            return Amx::detect().map(Self::of);
+        }
+        None
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    fn of(unit: Amx) -> Self {
+        Self {
+            tiles: amx::Tiles::cut(unit),
         }
     }
-    sums
+
+    /// [`byte_tile`] of 16 rows one after another: whole tiles by tiles, the rest by vectors.
+    #[cfg(target_arch = "x86_64")]
+    pub(crate) fn multiply(&self, rows: &[u8], panel: &[i8]) -> [[i32; PANEL]; BYTE_ROWS] {
+        let depth = panel.len() / PANEL;
+        let (mut sums, done) = self.tiles.multiply_bytes(rows, panel);
+        if done < depth {
+            let rest = std::array::from_fn(|r| &rows[r * depth + done..(r + 1) * depth]);
+            let rest = byte_tile::<BYTE_ROWS>(rest, &panel[done * PANEL..]);
+            for (sums, rest) in sums.iter_mut().zip(&rest) {
+                for (sum, rest) in sums.iter_mut().zip(rest) {
+                    *sum += rest;
+                }
+            }
+        }
+        sums
+    }
+
+    #[cfg(not(target_arch = "x86_64"))]
+    pub(crate) fn multiply(&self, _: &[u8], _: &[i8]) -> [[i32; PANEL]; BYTE_ROWS] {
+        match self.never {}
+    }
 }
 
 /// A cache line of pairs.

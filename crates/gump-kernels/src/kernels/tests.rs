@@ -360,7 +360,7 @@ fn bytes_are_summed_exactly() {
                 None => eprintln!("skipped: this processor has no avx512"),
             }
             match Amx::detect() {
-                Some(unit) => assert_eq!(amx_bytes(unit, &all, &panel), plain),
+                Some(unit) => assert_eq!(ByteTiles::of(unit).multiply(&all, &panel), plain),
                 None => eprintln!("skipped: this processor has no amx"),
             }
         }
