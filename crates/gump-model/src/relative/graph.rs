@@ -322,31 +322,18 @@ impl View {
     /// The same of an agent that may stand: whether it has room to drive on.
     pub fn has_room(&self, own: &Shown) -> bool {
         let speed = own.velocity().length();
-        let shuts = |(_, row): &(u32, EdgeRow)| {
-            let is_shut = row[OF_LIGHT + 1] + row[OF_LIGHT + 2] > 0.0;
-            is_shut && is_on_path(row) && away(row) < ROOM_M + LIGHT_S * speed
-        };
-        self.has_nobody_ahead(own) && !self.pieces.iter().any(shuts)
-    }
-
-    /// Whether no agent is near on the paths ahead or about to come near.
-    pub fn has_nobody_ahead(&self, own: &Shown) -> bool {
-        let speed = own.velocity().length();
+        let away = |row: &EdgeRow| 30.0 * f64::from(row[OF_PATH + 3]);
+        let is_on_path = |row: &EdgeRow| row[OF_PATH..][..PATHS].iter().any(|on| *on > 0.0);
         let holds = |(_, row): &(usize, EdgeRow)| {
             let is_near = f64::from(row[OF_GAP + 1]) < bend(GAP_M / 0.5);
             is_near || is_on_path(row) && away(row) < ROOM_M + HEADWAY_S * speed
         };
-        !self.neighbours.iter().any(holds)
+        let shuts = |(_, row): &(u32, EdgeRow)| {
+            let is_shut = row[OF_LIGHT + 1] + row[OF_LIGHT + 2] > 0.0;
+            is_shut && is_on_path(row) && away(row) < ROOM_M + LIGHT_S * speed
+        };
+        !self.neighbours.iter().any(holds) && !self.pieces.iter().any(shuts)
     }
-}
-
-/// Distance along the path ahead, metres.
-fn away(row: &EdgeRow) -> f64 {
-    30.0 * f64::from(row[OF_PATH + 3])
-}
-
-fn is_on_path(row: &EdgeRow) -> bool {
-    row[OF_PATH..][..PATHS].iter().any(|on| *on > 0.0)
 }
 
 /// The edges of agent `i` of those of a frame. With a route there is one path ahead, along it.

@@ -276,8 +276,7 @@ impl TrackDriver for NetworkDriver {
                     let log = [logs[a][t], logs[a][t + 1]];
                     now.body.kind == AgentKind::Vehicle && is_queued(now.pose, log, &lines)
                 };
-                let view = |i: usize| look(map, lights, &agents, i, None);
-                let has_room = |i: usize| view(i).has_room(&agents[i]);
+                let has_room = |i: usize| look(map, lights, &agents, i, None).has_room(&agents[i]);
                 let ways = |now: &Shown| match now.body.kind {
                     AgentKind::Vehicle | AgentKind::Bicycle => courses(streets, lights, now, None),
                     _ => Vec::new(),
@@ -301,9 +300,7 @@ impl TrackDriver for NetworkDriver {
                     let stays = stays[a] || is_queued(a, now);
                     let mut road = Road::ahead_of(now, stays, streets, lights);
                     if !stays {
-                        road = road
-                            .yielding(yields(i).min(keeps_clear(i)))
-                            .closing_up(now, || view(i).has_nobody_ahead(now));
+                        road = road.yielding(yields(i).min(keeps_clear(i)));
                     }
                     let is_parked = || stood[a] && road.is_away_from_junctions() && has_room(i);
                     let stays = stays || is_parked();

@@ -6,7 +6,8 @@
 //! that comes to a red light or a stop sign too fast runs it, and one that comes to a junction before
 //! others takes their way (`right_of_way`). And the direction at junctions: who turns neither way where
 //! the road ends drives off it. Queues would leave later with each update, too: who stands and has room
-//! is drawn again, which makes it start sooner or later.
+//! is drawn again, which makes it start sooner or later; and who is slow gets going, or it would come to rest
+//! a little later.
 
 use std::cell::OnceCell;
 
@@ -71,16 +72,9 @@ const ALONG: f64 = 0.4;
 const PER_RADIAN: f64 = 4.0;
 const LOOK_M: f64 = 5.0;
 
-/// A vehicle that is the first before a red light drives on up to this, metres from the line to its front,
-/// as fast as this braking allows, metres per second squared, or gains this in a step, metres per second.
-const NEAR_LINE_M: f64 = 3.0;
-const EASES_MPS2: f64 = 0.4;
-const CLOSES_UP_MPS: f64 = 0.4;
-
-/// A vehicle that stands, or moves no farther than this in a step, metres, has this fault, metres per
-/// second, ...
-const CREEPS_M: f64 = 0.15;
-const STAYS_MPS: f64 = 0.3;
+/// A vehicle that is slower than this gains so much in a step, metres per second, ...
+const SLOW_MPS: f64 = 3.0;
+const GETS_GOING_MPS: f64 = 0.3;
 /// ... if it has room, and no junction or stop sign within this, metres, or one that is open to it.
 const START_M: f64 = 12.0;
 
@@ -97,8 +91,6 @@ pub(super) struct Road<'a> {
     calm: f64,
     /// The same for vehicles with right of way alone.
     gives_way: f64,
-    /// Least speed of the first vehicle before a red light, metres per second; 0 for all others.
-    least: f64,
     /// Whether it is at a junction.
     turns: bool,
     /// Whether it has nothing to slow down for, or to stand for; determined when it is asked for.
@@ -133,7 +125,6 @@ impl<'a> Road<'a> {
                 false => red,
             },
             gives_way: f64::INFINITY,
-            least: 0.0,
             turns: on.is_some_and(|on| is_at_junction(streets, on)),
             is_free: OnceCell::new(),
             drives,
@@ -149,17 +140,6 @@ impl<'a> Road<'a> {
             gives_way: most,
             ..self
         }
-    }
-
-    /// The same with the least speed before a red light, if there is one on every way ahead. `leads` says
-    /// whether nobody is before the vehicle; it is asked only where that matters.
-    pub(super) fn closing_up(self, now: &Shown, leads: impl FnOnce() -> bool) -> Self {
-        let least = match self.drives {
-            true => least_before_red(self.streets, self.lights, now),
-            false => 0.0,
-        };
-        let least = if least > 0.0 && leads() { least } else { 0.0 };
-        Self { least, ..self }
     }
 
     /// The greatest speed for bends, lights, signs and vehicles with right of way of who need not hurry,
@@ -212,10 +192,13 @@ impl<'a> Road<'a> {
             _ => self.most,
         };
         let bend = (next - most).min(BRAKES_MPS - lost).max(0.0);
-        let stands = speed * TOKEN_DT <= CREEPS_M;
+        let is_slow = speed < SLOW_MPS;
         let is_free = || {
             let of_road = || match self.on {
-                Some(on) if stands => may_start(self.streets, self.lights, on),
+                Some(on) if is_slow => {
+                    speed < bend_speed(self.streets, on.0, on.1, EASY)
+                        && may_start(self.streets, self.lights, on)
+                }
                 Some(on) => goes_on(self.streets, on, speed),
                 None => false,
             };
@@ -224,25 +207,21 @@ impl<'a> Road<'a> {
                 .get_or_init(|| self.gives_way.is_infinite() && of_road() && has_room())
         };
         let as_slow = logged.is_some_and(|logged| next > logged - AS_LOGGED_MPS);
-        let is_held = as_slow || self.gives_way.is_finite() || turn > STRAIGHT;
-        let short = match is_held {
-            true => 0.0,
-            false => (self.least.min(speed + CLOSES_UP_MPS) - next).max(0.0),
-        };
         let is_free = || !(as_slow && self.turns) && is_free();
         let slow = match lost > SLOWS_MPS && turn <= STRAIGHT && is_free() {
             true => lost - SLOWS_MPS,
             false => 0.0,
         };
-        let stays = match stands && step.position.length() <= CREEPS_M && is_free() {
-            true => STAYS_MPS,
+        let wanted = SLOW_MPS.min(speed + GETS_GOING_MPS);
+        let dawdles = match is_slow && next < wanted && is_free() {
+            true => wanted - next,
             false => 0.0,
         };
         let astray = match self.turns {
             true => astray(self.streets, now.pose * *step),
             false => 0.0,
         };
-        body + bend + slow.max(stays).max(short) + astray
+        body + bend + slow.max(dawdles) + astray
     }
 }
 
@@ -263,27 +242,6 @@ fn most_speed(
         |(lane, at, _): (&Lane, f64, f64)| approach_speed(streets, lane, at, limits, &entering);
     let speeds = lanes_under(streets, now.pose).map(of);
     speeds.reduce(f64::max).unwrap_or(f64::INFINITY)
-}
-
-/// The least speed of the first vehicle before a red light, metres per second: that from which it stops
-/// before the line with little braking. 0 near the line, and where a way ahead has no red light.
-fn least_before_red(streets: &MapGraph, lights: &Lights, now: &Shown) -> f64 {
-    let is_red = |(_, colour, _): &(_, LightState, _)| *colour == LightState::Red;
-    if !lights.by_lane.iter().any(is_red) {
-        return 0.0;
-    }
-    let entering = |lane: &Lane, metres: f64| match lights.colour(lane.id) {
-        Some(LightState::Red) => {
-            let room = metres - now.body.length / 2.0 - NEAR_LINE_M;
-            (2.0 * EASES_MPS2 * room.max(0.0)).sqrt()
-        }
-        _ => f64::INFINITY,
-    };
-    let of = |(lane, at, _): (&Lane, f64, f64)| {
-        approach_speed(streets, lane, at, STRAIGHT_ON, &entering)
-    };
-    let most = lanes_under(streets, now.pose).map(of).reduce(f64::max);
-    most.filter(|most| most.is_finite()).unwrap_or(0.0)
 }
 
 fn is_at_junction(streets: &MapGraph, (lane, at): (&Lane, f64)) -> bool {
@@ -361,7 +319,7 @@ fn goes_on(streets: &MapGraph, (lane, at): (&Lane, f64), speed: f64) -> bool {
     goes_on && ahead.iter().all(is_open) && speed < bend_speed(streets, lane, at, EASY)
 }
 
-/// Whether a vehicle that stands may start as far as the road is concerned: no junction or stop sign is
+/// Whether a vehicle that stands or is slow may gain speed as far as the road is concerned: no junction or stop sign is
 /// near, it is in a junction, or all that its lane leads to, but left turns, is green.
 fn may_start(streets: &MapGraph, lights: &Lights, (lane, at): (&Lane, f64)) -> bool {
     let (ahead, _) = lanes_ahead(streets, lane, at, START_M);
@@ -442,35 +400,6 @@ mod tests {
         // A right turn goes slowly.
         let right = |next: f64| at((57.5, 50.0), (1.5, next), LightState::Red);
         assert!(right(1.9) == 0.0 && right(3.4) > 0.0);
-    }
-
-    #[test]
-    fn who_is_first_before_a_red_light_drives_up_to_the_line() {
-        let map = streets(
-            "lane 1: 0,0 60,0 next 2,3\nlane 2: 60,0 120,0\nlane 3: 60,0 66,-1 70,-8 70,-40",
-        );
-        let with = |x: f64, (speed, next): (f64, f64), lanes: &[i64], leads, logged| {
-            let now = Shown::first(BODY, Pose::new(x, 0.0, 0.0), dvec2(speed, 0.0));
-            let by_lane = lanes.iter().map(|id| (LaneId(*id), LightState::Red, None));
-            let lights = Lights {
-                by_lane: by_lane.collect(),
-            };
-            let road = Road::ahead_of(&now, false, &map, &lights).closing_up(&now, || leads);
-            road.fault(&now, &Pose::new(next * TOKEN_DT, 0.0, 0.0), logged, || {
-                false
-            })
-        };
-        let first = |x: f64, speeds| with(x, speeds, &[2, 3], true, None);
-        // The front is 13 m from the line, 10 m of which are to be driven: 2.8 m/s are the least.
-        assert!((first(44.75, (0.0, 0.0)) - CLOSES_UP_MPS).abs() < 1e-9);
-        assert!(first(44.75, (4.0, 2.0)) > 0.7 && first(44.75, (4.0, 3.0)) == 0.0);
-        // 3 m from it, and over it.
-        assert!(first(54.8, (0.0, 0.0)) == 0.0 && first(59.0, (0.0, 0.0)) == 0.0);
-        // Another is before it; its log is as slow; one of the ways is open.
-        assert_eq!(with(44.75, (0.0, 0.0), &[2, 3], false, None), 0.0);
-        assert_eq!(with(44.75, (0.0, 0.0), &[2, 3], true, Some(0.1)), 0.0);
-        assert!(with(44.75, (0.0, 0.0), &[2, 3], true, Some(2.0)) > 0.0);
-        assert_eq!(with(44.75, (0.0, 0.0), &[2], true, None), 0.0);
     }
 
     #[test]
@@ -592,6 +521,19 @@ mod tests {
         assert!(stays(55.0, Some(Green), true) && stays(75.0, Some(Red), true));
         // At the end of the map.
         assert!(!stays(195.0, None, true));
+    }
+
+    #[test]
+    fn who_is_slow_on_a_free_road_gets_going() {
+        let map = junction();
+        let at = |x: f64, speeds| fault(&map, x, speeds, 0.0);
+        assert!((at(10.0, (1.5, 1.2)) - 0.6).abs() < 1e-9);
+        assert_eq!(at(10.0, (1.5, 1.8)), 0.0);
+        // Up to 3 m/s; in a junction too, but not just before one.
+        assert!((at(10.0, (2.9, 2.8)) - 0.2).abs() < 1e-9);
+        assert_eq!(at(10.0, (3.0, 2.8)), 0.0);
+        assert!(at(75.0, (1.5, 1.2)) > 0.5);
+        assert_eq!(at(50.0, (1.5, 0.9)), 0.0);
     }
 
     #[test]
