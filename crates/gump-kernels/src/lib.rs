@@ -26,6 +26,10 @@ mod error;
 pub mod gelu;
 pub mod gemm;
 pub mod gru;
+#[cfg_attr(
+    not(target_arch = "x86_64"),
+    allow(dead_code, reason = "no other processor has a unit that reads them")
+)]
 pub mod half_pages;
 mod kernels;
 pub mod norm;

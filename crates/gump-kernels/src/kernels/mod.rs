@@ -94,6 +94,7 @@ pub(crate) fn has_unit() -> bool {
 }
 
 /// As [`crate::half_pages::attend`], whose shapes fit.
+#[cfg(target_arch = "x86_64")]
 pub(crate) fn attend_half(
     heads: HalfHeads,
     pages: &[&HalfPage],
@@ -103,13 +104,24 @@ pub(crate) fn attend_half(
     room: &mut Room,
 ) {
     match unit().expect("who has such pages has a unit") {
-        #[cfg(target_arch = "x86_64")]
         AnyUnit::Amx(unit) => half_attention::attend(unit, heads, pages, q, visible, out, room),
-        #[cfg(target_arch = "x86_64")]
         AnyUnit::Avx512Bf16(unit) => {
             half_attention::attend(unit, heads, pages, q, visible, out, room);
         }
     }
+}
+
+/// No other processor has a unit, nor such pages.
+#[cfg(not(target_arch = "x86_64"))]
+pub(crate) fn attend_half(
+    _: HalfHeads,
+    _: &[&HalfPage],
+    _: &[f32],
+    _: &[usize],
+    _: &mut [f32],
+    _: &mut Room,
+) {
+    unreachable!("who has such pages has a unit")
 }
 
 /// A right matrix, rounded to bfloat16 and packed once for many products.
@@ -307,6 +319,7 @@ pub(crate) struct Pairs(Vec<Line>);
 
 impl Pairs {
     /// None yet.
+    #[cfg(target_arch = "x86_64")]
     const fn none() -> Self {
         Self(Vec::new())
     }
