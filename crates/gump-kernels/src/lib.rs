@@ -2,10 +2,10 @@
 //!
 //! What lives here: products of matrices over checked slices ([`gemm`]), the kernels among which one
 //! is chosen for the processor at run time ([`Kernel`], [`Choice`]), weights packed once for many
-//! products ([`panels`]), attention in bfloat16 ([`half_pages`]), sums in a fixed order ([`rows`]), and the row-wise parts of layers that
-//! training and inference share ([`gelu`], [`gru`], [`norm`], [`edge_attention`]). What does not:
-//! tensors, gradients and layers, which are `gump-nn`'s. All `unsafe` of the workspace is in `gemm`
-//! and `kernels`.
+//! products ([`panels`]), attention in bfloat16 ([`half_pages`]), sums in a fixed order ([`rows`]),
+//! and the row-wise parts of layers that training and inference share ([`gelu`], [`gru`], [`norm`],
+//! [`edge_attention`]). What does not: tensors, gradients and layers, which are `gump-nn`'s. All
+//! `unsafe` of the workspace is in `gemm` and `kernels`.
 //!
 //! Results are bit-identical for any number of threads: work is cut by shape, and sums are added in
 //! a fixed order.

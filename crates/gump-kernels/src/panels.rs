@@ -278,7 +278,8 @@ impl Panels {
         let (k, n) = (self.n_in, self.n_out);
         let depth = k.next_multiple_of(4);
         let rows = x.len() / k;
-        let tiles = ByteTiles::cut().filter(|_| rows >= FEWEST_TILED);
+        let is_tiled = rows >= FEWEST_TILED;
+        let tiles = is_tiled.then(ByteTiles::cut).flatten();
         let tiled = match &tiles {
             Some(_) if rows % BYTE_ROWS >= FEWEST_TILED => rows.next_multiple_of(BYTE_ROWS),
             Some(_) => rows - rows % BYTE_ROWS,

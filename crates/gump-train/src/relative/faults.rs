@@ -6,8 +6,7 @@
 //! that comes to a red light or a stop sign too fast runs it, and one that comes to a junction before
 //! others takes their way (`right_of_way`). And the direction at junctions: who turns neither way where
 //! the road ends drives off it. Queues would leave later with each update, too: who stands and has room
-//! is drawn again, which makes it start sooner or later; and who is slow gets going, or it would come to rest
-//! a little later.
+//! is drawn again, which makes it start sooner or later.
 
 use std::cell::OnceCell;
 
@@ -72,9 +71,10 @@ const ALONG: f64 = 0.4;
 const PER_RADIAN: f64 = 4.0;
 const LOOK_M: f64 = 5.0;
 
-/// A vehicle that is slower than this gains so much in a step, metres per second, ...
-const SLOW_MPS: f64 = 3.0;
-const GETS_GOING_MPS: f64 = 0.3;
+/// A vehicle that stands, or moves no farther than this in a step, metres, has this fault, metres per
+/// second, ...
+const CREEPS_M: f64 = 0.15;
+const STAYS_MPS: f64 = 0.3;
 /// ... if it has room, and no junction or stop sign within this, metres, or one that is open to it.
 const START_M: f64 = 12.0;
 
@@ -192,13 +192,10 @@ impl<'a> Road<'a> {
             _ => self.most,
         };
         let bend = (next - most).min(BRAKES_MPS - lost).max(0.0);
-        let is_slow = speed < SLOW_MPS;
+        let stands = speed * TOKEN_DT <= CREEPS_M;
         let is_free = || {
             let of_road = || match self.on {
-                Some(on) if is_slow => {
-                    speed < bend_speed(self.streets, on.0, on.1, EASY)
-                        && may_start(self.streets, self.lights, on)
-                }
+                Some(on) if stands => may_start(self.streets, self.lights, on),
                 Some(on) => goes_on(self.streets, on, speed),
                 None => false,
             };
@@ -212,16 +209,15 @@ impl<'a> Road<'a> {
             true => lost - SLOWS_MPS,
             false => 0.0,
         };
-        let wanted = SLOW_MPS.min(speed + GETS_GOING_MPS);
-        let dawdles = match is_slow && next < wanted && is_free() {
-            true => wanted - next,
+        let stays = match stands && step.position.length() <= CREEPS_M && is_free() {
+            true => STAYS_MPS,
             false => 0.0,
         };
         let astray = match self.turns {
             true => astray(self.streets, now.pose * *step),
             false => 0.0,
         };
-        body + bend + slow.max(dawdles) + astray
+        body + bend + slow + stays + astray
     }
 }
 
@@ -319,7 +315,7 @@ fn goes_on(streets: &MapGraph, (lane, at): (&Lane, f64), speed: f64) -> bool {
     goes_on && ahead.iter().all(is_open) && speed < bend_speed(streets, lane, at, EASY)
 }
 
-/// Whether a vehicle that stands or is slow may gain speed as far as the road is concerned: no junction or stop sign is
+/// Whether a vehicle that stands may start as far as the road is concerned: no junction or stop sign is
 /// near, it is in a junction, or all that its lane leads to, but left turns, is green.
 fn may_start(streets: &MapGraph, lights: &Lights, (lane, at): (&Lane, f64)) -> bool {
     let (ahead, _) = lanes_ahead(streets, lane, at, START_M);
@@ -521,19 +517,6 @@ mod tests {
         assert!(stays(55.0, Some(Green), true) && stays(75.0, Some(Red), true));
         // At the end of the map.
         assert!(!stays(195.0, None, true));
-    }
-
-    #[test]
-    fn who_is_slow_on_a_free_road_gets_going() {
-        let map = junction();
-        let at = |x: f64, speeds| fault(&map, x, speeds, 0.0);
-        assert!((at(10.0, (1.5, 1.2)) - 0.6).abs() < 1e-9);
-        assert_eq!(at(10.0, (1.5, 1.8)), 0.0);
-        // Up to 3 m/s; in a junction too, but not just before one.
-        assert!((at(10.0, (2.9, 2.8)) - 0.2).abs() < 1e-9);
-        assert_eq!(at(10.0, (3.0, 2.8)), 0.0);
-        assert!(at(75.0, (1.5, 1.2)) > 0.5);
-        assert_eq!(at(50.0, (1.5, 0.9)), 0.0);
     }
 
     #[test]
