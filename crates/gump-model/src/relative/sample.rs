@@ -220,6 +220,18 @@ impl State {
         }
     }
 
+    /// The same, for an agent that was held at a pose although it had to come to another one, which is the
+    /// target.
+    pub fn held_at(self, pose: Pose, wanted: Pose) -> Self {
+        Self {
+            logged: wanted,
+            shown: pose,
+            weight: 1.0,
+            off: Off::default(),
+            ..self
+        }
+    }
+
     /// The same, for an agent that was driven.
     pub fn driven_to(self, shown: Pose) -> Self {
         let off = self.logged.inverse() * shown;

@@ -36,7 +36,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
 use crate::relative::crowd::Crowd;
-use crate::relative::faults::{Road, sign_lines};
+use crate::relative::faults::{CREEPS_M, Road, sign_lines};
 use crate::relative::pace::Pace;
 
 /// Frames that are shown as logged before the network drives: one move, so that it has seen agents
@@ -71,6 +71,8 @@ const RULED: u64 = 1 << 32;
 const FAULT: usize = 1 << 16;
 /// Separates agents that are added to a sample from its draws.
 const CROWD: u64 = 1 << 33;
+/// Separates the stream of those that are held at a green light.
+const HOLD: u64 = 1 << 35;
 
 /// Separates routes beyond the log from its draws.
 const ROUTE: u64 = 1 << 34;
@@ -106,6 +108,11 @@ pub struct RelativeDrives {
     /// network's own: it learns from them to do what it does, without the tail that was cut off, so
     /// that people turn and vehicles change lane less with every update.
     pub unchanged: f32,
+    /// How often in those samples a vehicle that stands at a green light, and could start, is held there
+    /// for a step, with its start as the target. In logs nobody who has the way free stands at a light
+    /// that has been green for a second: a network that misses its start has never seen that, and stands
+    /// on (docs/results/0047-missed-starts.md). Above 0, to slow down before a green light is a fault, too.
+    pub held: f64,
     /// Agents that are added to those samples.
     pub crowd: Crowd,
 }
@@ -124,6 +131,7 @@ impl Default for RelativeDrives {
             redraws: 8,
             top_p: 0.95,
             unchanged: 1.0,
+            held: 0.0,
             crowd: Crowd::default(),
         }
     }
@@ -144,6 +152,9 @@ impl RelativeDrives {
             if !(0.0..=1.0).contains(&share) {
                 return fail(key, &format!("{name} must be between 0 and 1"));
             }
+        }
+        if !(0.0..1.0).contains(&self.held) {
+            return fail("closed_loop.held", "held must be at least 0 and below 1");
         }
         if !(0.0..=1.0).contains(&self.unchanged) {
             let what = "unchanged must be between 0 and 1";
@@ -171,6 +182,9 @@ impl RelativeDrives {
 
 /// By how much a move of an agent, given by its index, is beyond what drivers do.
 type Fault<'a> = dyn Fn(usize, &Pose) -> f64 + 'a;
+
+/// The move of an agent that has drawn none without a fault, if there is one that drivers make.
+type WayOut<'a> = dyn Fn(usize) -> Option<Pose> + 'a;
 
 /// A snapshot of the network at a step, which drives.
 pub(crate) struct NetworkDriver {
@@ -299,6 +313,9 @@ impl TrackDriver for NetworkDriver {
                 for (i, (&a, now)) in here.iter().zip(&agents).enumerate() {
                     let stays = stays[a] || is_queued(a, now);
                     let mut road = Road::ahead_of(now, stays, streets, lights);
+                    if self.config.held == 0.0 {
+                        road = road.blind_to_green();
+                    }
                     if !stays {
                         road = road.yielding(yields(i).min(keeps_clear(i)));
                     }
@@ -326,10 +343,21 @@ impl TrackDriver for NetworkDriver {
                         roads[i].fault(own, step, logged, || has_room(i)) + pace
                     }
                 };
-                let ground = (lane_map, &fault as &Fault<'_>);
+                let way_out = |i: usize| roads[i].starts(&agents[i], || has_room(i));
+                let judge = (&fault as &Fault<'_>, &way_out as &WayOut<'_>);
+                let ground = (lane_map, judge);
                 let moves = self.moves_by_the_rules(crowd, ground, &hidden, seed, &mut room);
-                for ((&a, now), (step, is_unchanged)) in here.iter().zip(&agents).zip(moves) {
+                let held = self.config.held;
+                let each = here.iter().zip(&agents).zip(moves).enumerate();
+                for (i, ((&a, now), (step, is_unchanged))) in each {
                     if let Some(next) = tracks[a].states[t + 1].as_mut().filter(|_| !stays[a]) {
+                        let starts = step.position.length() > CREEPS_M
+                            && given[i].is_none()
+                            && way_out(i).is_some();
+                        if starts && seed.fork(HOLD).fork(i as u64).rng().random_bool(held) {
+                            *next = next.held_at(now.pose, now.pose * step);
+                            continue;
+                        }
                         let weight = match is_unchanged {
                             true => self.config.unchanged,
                             false => 1.0,
@@ -365,7 +393,7 @@ impl NetworkDriver {
     fn moves_by_the_rules(
         &self,
         (agents, given): (&[Shown], &[Option<Pose>]),
-        (lane_map, fault): (&LaneMap, &Fault<'_>),
+        (lane_map, (fault, way_out)): (&LaneMap, (&Fault<'_>, &WayOut<'_>)),
         hidden: &[f32],
         seed: Seed,
         room: &mut Workspace,
@@ -403,6 +431,10 @@ impl NetworkDriver {
                 }
             }
             faulty.retain(|(_, least)| *least > 0.0);
+        }
+        for (i, least) in faulty {
+            let out = way_out(i).filter(|step| fault(i, step) < least);
+            moves[i] = out.unwrap_or(moves[i]);
         }
         let mut again = |who: &[usize], attempt: usize| drawn(who, attempt + 1);
         let redraws = self.config.redraws;

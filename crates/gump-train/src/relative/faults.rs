@@ -73,10 +73,12 @@ const LOOK_M: f64 = 5.0;
 
 /// A vehicle that stands, or moves no farther than this in a step, metres, has this fault, metres per
 /// second, ...
-const CREEPS_M: f64 = 0.15;
+pub(super) const CREEPS_M: f64 = 0.15;
 const STAYS_MPS: f64 = 0.3;
 /// ... if it has room, and no junction or stop sign within this, metres, or one that is open to it.
 const START_M: f64 = 12.0;
+/// How far a vehicle comes in its first step, metres: 1.6 m/s².
+const STARTS_M: f64 = 0.2;
 
 /// The road ahead of a vehicle.
 pub(super) struct Road<'a> {
@@ -95,6 +97,8 @@ pub(super) struct Road<'a> {
     turns: bool,
     /// Whether it has nothing to slow down for, or to stand for; determined when it is asked for.
     is_free: OnceCell<bool>,
+    /// Whether the light that it comes to is green; determined likewise.
+    is_open: OnceCell<bool>,
     /// Whether it is judged at all.
     drives: bool,
 }
@@ -127,6 +131,7 @@ impl<'a> Road<'a> {
             gives_way: f64::INFINITY,
             turns: on.is_some_and(|on| is_at_junction(streets, on)),
             is_free: OnceCell::new(),
+            is_open: OnceCell::new(),
             drives,
         }
     }
@@ -142,10 +147,51 @@ impl<'a> Road<'a> {
         }
     }
 
+    /// The same of a vehicle that may stop at green.
+    pub(super) fn blind_to_green(self) -> Self {
+        Self {
+            is_open: OnceCell::from(false),
+            ..self
+        }
+    }
+
     /// The greatest speed for bends, lights, signs and vehicles with right of way of who need not hurry,
     /// metres per second.
     pub(super) fn calm(&self) -> f64 {
         self.calm
+    }
+
+    /// The move of a vehicle that stands at a green light with nothing in its way.
+    ///
+    /// A network that has once missed the start stands on: in logs, who stands for long at green has a
+    /// reason. Then all its draws stand, and it would never learn to start.
+    pub(super) fn starts(&self, now: &Shown, has_room: impl Fn() -> bool) -> Option<Pose> {
+        let speed = now.velocity().length();
+        let starts = self.drives
+            && speed * TOKEN_DT <= CREEPS_M
+            && self.is_open()
+            && self.is_free(speed, has_room);
+        starts.then_some(Pose::new(STARTS_M, 0.0, 0.0))
+    }
+
+    /// Whether a vehicle at this speed has nothing to slow down for, or to stand for.
+    fn is_free(&self, speed: f64, has_room: impl Fn() -> bool) -> bool {
+        let stands = speed * TOKEN_DT <= CREEPS_M;
+        let of_road = || match self.on {
+            Some(on) if stands => self.is_open() || may_start(self.streets, self.lights, on),
+            Some(on) if self.is_open() => crosses(self.streets, on, speed),
+            Some(on) => goes_on(self.streets, on, speed),
+            None => false,
+        };
+        *self
+            .is_free
+            .get_or_init(|| self.gives_way.is_infinite() && of_road() && has_room())
+    }
+
+    /// Whether it comes to a light, and all lanes that it may enter there are green.
+    fn is_open(&self) -> bool {
+        let is_open = |on| is_open(self.streets, self.lights, on);
+        *self.is_open.get_or_init(|| self.on.is_some_and(is_open))
     }
 
     /// Whether no junction, stop sign or light is near that could hold a vehicle here: one that stands
@@ -163,8 +209,8 @@ impl<'a> Road<'a> {
     ///
     /// `has_room` says whether the vehicle sees nothing to slow down for, or to stand for. `logged` is the
     /// speed of its log here, metres per second, if it is on its log's way. No bend is too sharp for that;
-    /// and at a junction the log may be as slow for a reason that the vehicle does not see. Elsewhere it
-    /// would learn to slow down for nothing.
+    /// and at a junction the log may be as slow for a reason that the vehicle does not see, unless the
+    /// light is green. Elsewhere it would learn to slow down for nothing.
     pub(super) fn fault(
         &self,
         now: &Shown,
@@ -193,18 +239,10 @@ impl<'a> Road<'a> {
         };
         let bend = (next - most).min(BRAKES_MPS - lost).max(0.0);
         let stands = speed * TOKEN_DT <= CREEPS_M;
-        let is_free = || {
-            let of_road = || match self.on {
-                Some(on) if stands => may_start(self.streets, self.lights, on),
-                Some(on) => goes_on(self.streets, on, speed),
-                None => false,
-            };
-            *self
-                .is_free
-                .get_or_init(|| self.gives_way.is_infinite() && of_road() && has_room())
-        };
         let as_slow = logged.is_some_and(|logged| next > logged - AS_LOGGED_MPS);
-        let is_free = || !(as_slow && self.turns) && is_free();
+        // The log may have come here, and waited, while the light was red.
+        let has_reason = as_slow && self.turns && !self.is_open();
+        let is_free = || !has_reason && self.is_free(speed, &has_room);
         let slow = match lost > SLOWS_MPS && turn <= STRAIGHT && is_free() {
             true => lost - SLOWS_MPS,
             false => 0.0,
@@ -315,6 +353,20 @@ fn goes_on(streets: &MapGraph, (lane, at): (&Lane, f64), speed: f64) -> bool {
     goes_on && ahead.iter().all(is_open) && speed < bend_speed(streets, lane, at, EASY)
 }
 
+/// Whether a lane goes on from here, through a junction, without a stop sign or a bend on any of its
+/// ways that drivers at this speed slow down for.
+fn crosses(streets: &MapGraph, (lane, at): (&Lane, f64), speed: f64) -> bool {
+    let (ahead, goes_on) = lanes_ahead(streets, lane, at, FREE_M);
+    let is_easy = |part: &LaneAhead<'_>| {
+        let braked = 2.0 * EASY.braking_mps2 * part.base_m.max(0.0);
+        speed < bend_speed(streets, part.lane, 0.0, EASY).hypot(braked.sqrt())
+    };
+    goes_on
+        && !ahead.iter().any(|part| has_sign(streets, part.lane))
+        && ahead[1..].iter().all(is_easy)
+        && speed < bend_speed(streets, lane, at, EASY)
+}
+
 /// Whether a vehicle that stands may start as far as the road is concerned: no junction or stop sign is
 /// near, it is in a junction, or all that its lane leads to, but left turns, is green.
 fn may_start(streets: &MapGraph, lights: &Lights, (lane, at): (&Lane, f64)) -> bool {
@@ -332,6 +384,26 @@ fn may_start(streets: &MapGraph, lights: &Lights, (lane, at): (&Lane, f64)) -> b
     let ends = ahead.len() == 1 && lane.centerline.length() - at < START_M;
     let signed = ahead.iter().any(|part| has_sign(streets, part.lane));
     lane.in_intersection || !ends && !signed && !ahead[1..].iter().any(|part| closed(&part))
+}
+
+/// Whether a lane leads to a junction within [`FREE_M`], and all lanes that it enters there are green.
+fn is_open(streets: &MapGraph, lights: &Lights, (lane, at): (&Lane, f64)) -> bool {
+    let (ahead, _) = lanes_ahead(streets, lane, at, FREE_M);
+    let is_green = |part: &LaneAhead<'_>| lights.colour(part.lane.id) == Some(LightState::Green);
+    let mut entries = ahead[1..]
+        .iter()
+        .filter(|part| enters(streets, part.lane))
+        .peekable();
+    !lane.in_intersection && entries.peek().is_some() && entries.all(is_green)
+}
+
+/// Whether a lane leads into a junction. Turns may consist of several lanes, of which only the first has a
+/// light.
+fn enters(streets: &MapGraph, lane: &Lane) -> bool {
+    lane.in_intersection
+        && !streets
+            .predecessors(lane.id)
+            .any(|from| from.in_intersection)
 }
 
 #[cfg(test)]
@@ -492,6 +564,60 @@ mod tests {
         // Less, or in a turn.
         assert_eq!(fault(&map, 10.0, (10.0, 9.7), 0.0), 0.0);
         assert_eq!(fault(&map, 10.0, (10.0, 9.0), 0.1), 0.0);
+    }
+
+    #[test]
+    fn at_green_nobody_slows_down_more_than_the_turn_needs() {
+        let after = |colour: Option<LightState>, way: &str| {
+            let road = format!("lane 1: 0,0 60,0 next 2\nlane 2: 60,0 {way} next 3\nlane 3: ");
+            let end = way.rsplit(' ').next().unwrap();
+            let beyond = if end == "90,0" { "200,0" } else { "70,-100" };
+            let mut parts = streets(&format!("{road}{end} {beyond}")).parts().clone();
+            parts.lanes[1].in_intersection = true;
+            let map = MapGraph::new(parts).unwrap();
+            move |x: f64, (speed, next): (f64, f64), logged: Option<f64>| {
+                let now = Shown::first(BODY, Pose::new(x, 0.0, 0.0), dvec2(speed, 0.0));
+                let by_lane = colour.map(|colour| (LaneId(2), colour, None));
+                let lights = Lights {
+                    by_lane: by_lane.into_iter().collect(),
+                };
+                let road = Road::ahead_of(&now, false, &map, &lights);
+                let step = Pose::new(next * TOKEN_DT, 0.0, 0.0);
+                road.fault(&now, &step, logged, || true)
+            }
+        };
+        let green = after(Some(LightState::Green), "90,0");
+        assert!((green(40.0, (8.0, 7.0), None) - 0.6).abs() < 1e-9);
+        assert_eq!(green(40.0, (8.0, 7.7), None), 0.0);
+        // Its log waited here; the light was red then.
+        assert!(green(56.0, (2.0, 1.0), Some(1.0)) > 0.5);
+        assert!(green(57.5, (0.0, 0.0), Some(0.0)) > 0.0);
+        for colour in [None, Some(LightState::Yellow), Some(LightState::Red)] {
+            let held = after(colour, "90,0");
+            assert_eq!(held(40.0, (8.0, 7.0), None), 0.0);
+            assert_eq!(held(57.5, (0.0, 0.0), Some(0.0)), 0.0);
+        }
+        // A turn with a radius of 7 m: 4.2 m/s are comfortable there, some 8 m/s 13 m before it.
+        let bend = "63,-0.5 66,-2 68,-4 69.5,-6.5 70,-9";
+        let right = after(Some(LightState::Green), bend);
+        assert_eq!(right(47.0, (10.0, 9.0), None), 0.0);
+        assert!(right(47.0, (6.0, 5.0), None) > 0.5);
+        // Who stands at green starts, if nobody is to be let pass.
+        let starts = |x: f64, colour: LightState, most: f64| {
+            let map = junction();
+            let now = Shown::first(BODY, Pose::new(x, 0.0, 0.0), dvec2(0.0, 0.0));
+            let lights = Lights {
+                by_lane: vec![(LaneId(2), colour, None)],
+            };
+            let road = Road::ahead_of(&now, false, &map, &lights).yielding(most);
+            road.starts(&now, || true)
+        };
+        let free = |x: f64, colour: LightState| starts(x, colour, f64::INFINITY);
+        let step = free(50.0, LightState::Green).unwrap();
+        assert!(step.position.x > CREEPS_M);
+        assert_eq!(starts(50.0, LightState::Green, 0.0), None);
+        assert_eq!(free(50.0, LightState::Red), None);
+        assert_eq!(free(10.0, LightState::Green), None);
     }
 
     #[test]

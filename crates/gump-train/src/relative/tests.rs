@@ -1,5 +1,7 @@
 //! The relative network: training against rollouts, resumed against uninterrupted runs.
 
+use std::sync::Arc;
+
 use candle_core::Device;
 use gump_engine::relative::{RelativeSampling, RelativeWorld};
 use gump_geometry::Pose;
@@ -10,7 +12,7 @@ use gump_model::relative::{RelativeConfig, RelativeNetwork, grid, is_relative, l
 use gump_nn::OptimizerConfig;
 use gump_nn::optimizer::AdamW;
 use gump_rollout::{SimulateConfig, Start, WorldModel as _, simulate};
-use gump_scene::{Scenario, Seed, fixture};
+use gump_scene::{MapGraph, Scenario, Seed, fixture};
 
 use super::*;
 use crate::gradients::Gradients;
@@ -421,6 +423,51 @@ fn vehicles_that_wait_at_lights_do_not_learn_to_start() {
     assert_eq!(starts("light 2 red: 40,0"), 0);
     assert_eq!(starts("light 2 green: 40,0"), 0);
     assert!(starts("") > 0);
+}
+
+/// Who could start at green is held, and the target is the start all the same.
+#[test]
+fn who_misses_the_start_at_green_learns_to_start() {
+    let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
+    let text = |colour: &str| {
+        format!(
+            "lane 1: 0,0 40,0 next 2\nlane 2: 40,0 60,0 next 3\nlane 3: 60,0 200,0
+             light 2 {colour}: 40,0\nego vehicle 0: 30,0 velocity 0.5,0"
+        )
+    };
+    // Steps in which it stands although the target is to move.
+    let held = |held: f64, colour: &str| {
+        let mut scenario = fixture::scenario(&text(colour)).unwrap();
+        let mut parts = scenario.map.parts().clone();
+        parts.lanes[1].in_intersection = true;
+        scenario.map = Arc::new(MapGraph::new(parts).unwrap());
+        let config = RelativeDrives {
+            share: 1.0,
+            ruled: 1.0,
+            held,
+            ..RelativeDrives::default()
+        };
+        let driver = drives::NetworkDriver::new(&network, &config).unwrap();
+        let of_seed = |seed| {
+            let sample = draw(&scenario, &SampleConfig::plain(), Some(&driver), Seed(seed));
+            let sample = sample.unwrap();
+            let is_held = |target: &&sample::Target| {
+                let led = (target.node as usize + 1) * NODE_NUMBERS + 8;
+                sample.nodes[led] == 0.0 && grid::dequantize(target.bins).position.x > 0.1
+            };
+            sample.targets.iter().skip(1).filter(is_held).count()
+        };
+        (0..12).map(of_seed).sum::<usize>()
+    };
+    assert!(held(0.75, "green") > 10, "{}", held(0.75, "green"));
+    assert_eq!(held(0.0, "green"), 0);
+    assert_eq!(held(0.75, "red"), 0);
+    let never = RelativeDrives {
+        held: 1.0,
+        ..RelativeDrives::default()
+    };
+    let message = never.validate().unwrap_err().to_string();
+    assert!(message.contains("held must be at least 0"), "{message}");
 }
 
 #[test]
