@@ -5,7 +5,7 @@
 //! ([`attend`]). What does not: whose pages they are and how long they are kept. Only where
 //! [`HalfHeads::new`] returns some does the processor have such a unit.
 
-use crate::kernels::{Pairs, attend_half, has_unit};
+use crate::kernels::{Pairs, attend_half, has_unit, wide};
 use crate::panels::PANEL;
 
 /// Tokens of a page: as many as a panel has columns, so that a page's keys are one panel.
@@ -73,26 +73,13 @@ impl HalfPage {
         assert!(at < PAGE, "a page has {PAGE} tokens");
         let all = self.0.all_mut();
         let (all_keys, all_values) = all.split_at_mut(heads.keys_len());
-        let of_head = all_keys.chunks_exact_mut(heads.key_pairs() * PAGE);
-        for (own, keys) in of_head.zip(keys.chunks_exact(heads.d)) {
-            let (pairs, odd) = keys.as_chunks::<2>();
-            for (pair, [low, high]) in pairs.iter().enumerate() {
-                own[pair * PAGE + at] = rounded(*low) | rounded(*high) << 16;
-            }
-            if let [low] = odd {
-                own[pairs.len() * PAGE + at] = rounded(*low);
-            }
-        }
-        let shift = 16 * (at % 2) as u32;
-        let of_head = all_values.chunks_exact_mut(heads.value_panels() * PAGE / 2 * PANEL);
-        for (own, values) in of_head.zip(values.chunks_exact(heads.d)) {
-            for (panel, values) in values.chunks(PANEL).enumerate() {
-                let row = &mut own[(panel * PAGE / 2 + at / 2) * PANEL..][..values.len()];
-                for (pair, value) in row.iter_mut().zip(values) {
-                    *pair = *pair & !(0xffff << shift) | rounded(*value) << shift;
-                }
-            }
-        }
+        wide(
+            #[inline(always)]
+            || {
+                write_keys(heads, at, keys, all_keys);
+                write_values(heads, at, values, all_values);
+            },
+        );
     }
 
     /// Keys of a head, the first so many pairs of channels.
@@ -108,6 +95,35 @@ impl HalfPage {
     }
 }
 
+#[inline(always)]
+fn write_keys(heads: HalfHeads, at: usize, keys: &[f32], all: &mut [u32]) {
+    let of_head = all.chunks_exact_mut(heads.key_pairs() * PAGE);
+    for (own, keys) in of_head.zip(keys.chunks_exact(heads.d)) {
+        let rows = own.as_chunks_mut::<PAGE>().0;
+        let (pairs, odd) = keys.as_chunks::<2>();
+        for (row, [low, high]) in rows.iter_mut().zip(pairs) {
+            row[at] = rounded(*low) | rounded(*high) << 16;
+        }
+        if let [low] = odd {
+            rows[pairs.len()][at] = rounded(*low);
+        }
+    }
+}
+
+#[inline(always)]
+fn write_values(heads: HalfHeads, at: usize, values: &[f32], all: &mut [u32]) {
+    let shift = 16 * (at % 2) as u32;
+    let of_head = all.chunks_exact_mut(heads.value_panels() * PAGE / 2 * PANEL);
+    for (own, values) in of_head.zip(values.chunks_exact(heads.d)) {
+        for (panel, values) in values.chunks(PANEL).enumerate() {
+            let row = &mut own[(panel * PAGE / 2 + at / 2) * PANEL..][..values.len()];
+            for (pair, value) in row.iter_mut().zip(values) {
+                *pair = *pair & !(0xffff << shift) | rounded(*value) << shift;
+            }
+        }
+    }
+}
+
 /// The nearest bfloat16, ties to even, in the lower half.
 #[inline(always)]
 fn rounded(x: f32) -> u32 {
@@ -119,6 +135,7 @@ fn rounded(x: f32) -> u32 {
 #[derive(Debug, Default)]
 pub struct Room {
     pub(crate) scores: Vec<f32>,
+    pub(crate) sums: Vec<f32>,
     pub(crate) left: Pairs,
 }
 

@@ -298,34 +298,44 @@ impl Panels {
             *scale = quantize_row(x, &mut bytes[..k]);
         }
         let row = |r: usize| &scratch.bytes[r * depth..][..depth];
+        let mut sums = [[0; PANEL]; 2 * BYTE_ROWS];
+        let all_scales = scales.as_chunks::<PANEL>().0;
+        let all_offsets = offsets.as_chunks::<PANEL>().0;
+        let all_bias = self.bias.as_chunks::<PANEL>().0;
         for (p, panel) in weights.chunks_exact(depth * PANEL).enumerate() {
-            let at = p * PANEL..(p + 1) * PANEL;
-            let (scales, offsets) = (&scales[at.clone()], &offsets[at.clone()]);
-            let bias = &self.bias[at];
-            let mut store = |r: usize, sums: &[i32; PANEL]| {
-                let input = scratch.scales[r];
-                let y = &mut y[r * n + p * PANEL..(r + 1) * n];
+            let (scales, offsets, bias) = (&all_scales[p], &all_offsets[p], &all_bias[p]);
+            let mut store = |first: usize, sums: &[[i32; PANEL]]| {
+                let y = y[first * n..].chunks_mut(n);
+                let rows = y.zip(&scratch.scales[first..]).zip(sums);
                 wide(
                     #[inline(always)]
                     || {
-                        let columns = sums.iter().zip(offsets).zip(scales).zip(bias);
-                        for (y, (((sum, offset), scale), bias)) in y.iter_mut().zip(columns) {
-                            *y = sum.wrapping_sub(*offset) as f32 * (input * scale) + bias;
+                        for ((y, input), sums) in rows {
+                            let column = |j: usize| {
+                                let sum = sums[j].wrapping_sub(offsets[j]) as f32;
+                                sum * (input * scales[j]) + bias[j]
+                            };
+                            let y = &mut y[p * PANEL..];
+                            match y.first_chunk_mut::<PANEL>() {
+                                Some(y) => *y = std::array::from_fn(column),
+                                None => y.iter_mut().enumerate().for_each(|(j, y)| *y = column(j)),
+                            }
                         }
                     },
                 );
             };
             if let Some(tiles) = &tiles {
-                let sixteens = scratch.bytes[..tiled * depth].chunks_exact(BYTE_ROWS * depth);
-                for (first, sixteen) in (0..rows).step_by(BYTE_ROWS).zip(sixteens) {
-                    let sums = tiles.multiply(sixteen, panel);
-                    let sums = (first..rows).zip(&sums);
-                    sums.for_each(|(r, sums)| store(r, sums));
+                let blocks = scratch.bytes[..tiled * depth].chunks(2 * BYTE_ROWS * depth);
+                for (first, block) in (0..rows).step_by(2 * BYTE_ROWS).zip(blocks) {
+                    let sums = &mut sums[..block.len() / depth];
+                    tiles.multiply(block, panel, sums);
+                    store(first, sums);
                 }
             }
             let done = tiled.min(rows);
             let row = |r: usize| row(done + r);
-            let mut store = |r: usize, sums: &[i32; PANEL]| store(done + r, sums);
+            let mut store =
+                |r: usize, sums: &[i32; PANEL]| store(done + r, std::slice::from_ref(sums));
             in_groups(rows - done, |group| match group {
                 Group::Many(rows) => {
                     let sums = byte_tile::<ROWS>(rows.map(row), panel);

@@ -21,6 +21,7 @@ use std::sync::OnceLock;
 
 use super::avx512_bf16::{Avx512Bf16, store_rows};
 use super::bf16::{Lanes, Target, Unit};
+use crate::gemm::Store;
 use crate::panels::PANEL;
 
 /// Rows of a tile, the most that the hardware has.
@@ -135,54 +136,126 @@ impl Tiles {
         Self(PhantomData)
     }
 
-    /// Products of 16 rows of unsigned bytes with a panel of signed ones, summed exactly; as deep as
-    /// whole tiles reach, which is returned too: what is left is another kernel's.
+    /// Products of 16 or 32 rows of unsigned bytes with a panel of signed ones, summed exactly into
+    /// `sums`; as deep as whole tiles reach, which is returned.
     ///
     /// `rows` are `depth` bytes each, one after another; `panel` is `[depth / 4, PANEL, 4]`.
     ///
-    /// Panics when they are not.
+    /// Panics when they are not, or `sums` are of another number of rows.
     pub(super) fn multiply_bytes(
         &self,
         rows: &[u8],
         panel: &[i8],
-    ) -> ([[i32; PANEL]; TILE], usize) {
+        sums: &mut [[i32; PANEL]],
+    ) -> usize {
         let depth = panel.len() / PANEL;
-        assert!(rows.len() == TILE * depth, "16 rows of {depth} bytes");
+        assert!(rows.len() == sums.len() * depth, "rows of {depth} bytes");
         let steps = depth / TILE_BYTES;
-        let mut sums = [[0i32; PANEL]; TILE];
-        // SAFETY: the value proves that the thread has cut the tiles; a step reads 64 bytes of each of
-        // the 16 rows, `depth` apart, and 16 rows of 128 bytes of the panel, `steps` times, which both
-        // were found to have; what is written is `sums`, 16 rows of 128 bytes.
-        unsafe {
-            asm!(
-                "tilezero tmm0",
-                "tilezero tmm1",
-                "test {steps}, {steps}",
-                "jz 3f",
-                "2:",
-                "tileloadd tmm4, [{rows} + {depth}*1]",
-                "tileloadd tmm6, [{panel} + {of_panel}*1]",
-                "tileloadd tmm7, [{panel} + {of_panel}*1 + 64]",
-                "tdpbusd tmm0, tmm4, tmm6",
-                "tdpbusd tmm1, tmm4, tmm7",
-                "add {rows}, 64",
-                "add {panel}, 2048",
-                "dec {steps}",
-                "jnz 2b",
-                "3:",
-                "tilestored [{sums} + {of_panel}*1], tmm0",
-                "tilestored [{sums} + {of_panel}*1 + 64], tmm1",
-                rows = inout(reg) rows.as_ptr() => _,
-                panel = inout(reg) panel.as_ptr() => _,
-                steps = inout(reg) steps => _,
-                sums = in(reg) sums.as_mut_ptr(),
-                depth = in(reg) depth,
-                of_panel = in(reg) PANEL_BYTES,
-                out("tmm0") _, out("tmm1") _, out("tmm4") _, out("tmm6") _, out("tmm7") _,
-                options(nostack)
-            );
+        if steps == 0 {
+            sums.as_flattened_mut().fill(0);
+            return 0;
         }
-        (sums, steps * TILE_BYTES)
+        let (rows, panel, depth) = (rows.as_ptr(), panel.as_ptr(), depth);
+        let to = sums.as_mut_ptr();
+        // SAFETY: the value proves that the thread has cut the tiles; rows and panel were found to
+        // be as long as their shapes, and `steps` is at least 1.
+        unsafe {
+            match sums.len() {
+                TILE => byte_sums(rows, panel, (depth, steps), to),
+                BLOCK => byte_sums_of_two(rows, panel, (depth, steps), to),
+                n => panic!("{n} rows are neither {TILE} nor {BLOCK}"),
+            }
+        }
+        steps * TILE_BYTES
+    }
+}
+
+/// The sums of 16 rows of bytes, `depth` apart, with a panel. A step is 64 bytes of a row.
+///
+/// # Safety
+/// The processor has the instructions and the tiles are cut; there are 16 rows of `steps` steps, at
+/// least 1, and 16 rows of 128 bytes of the panel for each; `sums` has 16 rows of 128 bytes.
+unsafe fn byte_sums(
+    rows: *const u8,
+    panel: *const i8,
+    (depth, steps): (usize, usize),
+    sums: *mut [i32; PANEL],
+) {
+    // SAFETY: as the function's.
+    unsafe {
+        asm!(
+            "tilezero tmm0",
+            "tilezero tmm1",
+            "2:",
+            "tileloadd tmm4, [{rows} + {depth}*1]",
+            "tileloadd tmm6, [{panel} + {of_panel}*1]",
+            "tileloadd tmm7, [{panel} + {of_panel}*1 + 64]",
+            "tdpbusd tmm0, tmm4, tmm6",
+            "tdpbusd tmm1, tmm4, tmm7",
+            "add {rows}, 64",
+            "add {panel}, 2048",
+            "dec {steps}",
+            "jnz 2b",
+            "tilestored [{sums} + {of_panel}*1], tmm0",
+            "tilestored [{sums} + {of_panel}*1 + 64], tmm1",
+            rows = inout(reg) rows => _,
+            panel = inout(reg) panel => _,
+            steps = inout(reg) steps => _,
+            sums = in(reg) sums,
+            depth = in(reg) depth,
+            of_panel = in(reg) PANEL_BYTES,
+            out("tmm0") _, out("tmm1") _, out("tmm4") _, out("tmm6") _, out("tmm7") _,
+            options(nostack)
+        );
+    }
+}
+
+/// As [`byte_sums`] of 32 rows: a tile of the panel is loaded once for two products.
+///
+/// # Safety
+/// As there, with 32 rows.
+unsafe fn byte_sums_of_two(
+    rows: *const u8,
+    panel: *const i8,
+    (depth, steps): (usize, usize),
+    sums: *mut [i32; PANEL],
+) {
+    // SAFETY: as the function's.
+    unsafe {
+        asm!(
+            "tilezero tmm0",
+            "tilezero tmm1",
+            "tilezero tmm2",
+            "tilezero tmm3",
+            "2:",
+            "tileloadd tmm4, [{rows} + {depth}*1]",
+            "tileloadd tmm6, [{panel} + {of_panel}*1]",
+            "tileloadd tmm7, [{panel} + {of_panel}*1 + 64]",
+            "tileloadd tmm5, [{below} + {depth}*1]",
+            "tdpbusd tmm0, tmm4, tmm6",
+            "tdpbusd tmm1, tmm4, tmm7",
+            "tdpbusd tmm2, tmm5, tmm6",
+            "tdpbusd tmm3, tmm5, tmm7",
+            "add {rows}, 64",
+            "add {below}, 64",
+            "add {panel}, 2048",
+            "dec {steps}",
+            "jnz 2b",
+            "tilestored [{sums} + {of_panel}*1], tmm0",
+            "tilestored [{sums} + {of_panel}*1 + 64], tmm1",
+            "tilestored [{sums} + {of_panel}*1 + 2048], tmm2",
+            "tilestored [{sums} + {of_panel}*1 + 2112], tmm3",
+            rows = inout(reg) rows => _,
+            below = inout(reg) rows.add(TILE * depth) => _,
+            panel = inout(reg) panel => _,
+            steps = inout(reg) steps => _,
+            sums = in(reg) sums,
+            depth = in(reg) depth,
+            of_panel = in(reg) PANEL_BYTES,
+            out("tmm0") _, out("tmm1") _, out("tmm2") _, out("tmm3") _,
+            out("tmm4") _, out("tmm5") _, out("tmm6") _, out("tmm7") _,
+            options(nostack)
+        );
     }
 }
 
@@ -197,6 +270,34 @@ impl Drop for Tiles {
                 options(nostack, nomem)
             );
         }
+    }
+}
+
+/// 32 rows of 32 numbers, so far apart.
+type Whole<'a> = (&'a mut [f32], usize);
+
+impl Amx {
+    /// Lets `sum` store sums, or add them, where they belong if that is a whole block, else beside it.
+    fn sum_into(self, to: &mut Target<'_>, sum: impl FnOnce(Store, Whole<'_>)) {
+        let is_whole = to.rows == BLOCK && to.columns == PANEL;
+        if is_whole && to.scale == 1.0 {
+            return sum(to.store, (&mut *to.data, to.stride));
+        }
+        let mut sums = [[0f32; PANEL]; BLOCK];
+        if to.scale == 1.0 {
+            // Sums go on from what is there, as in whole blocks: a row has the same bits in both.
+            if to.store == Store::Add {
+                for (r, sums) in sums.iter_mut().enumerate().take(to.rows) {
+                    sums[..to.columns].copy_from_slice(&to.data[r * to.stride..][..to.columns]);
+                }
+            }
+            sum(to.store, (sums.as_flattened_mut(), PANEL));
+            to.store = Store::Replace;
+        } else {
+            sum(Store::Replace, (sums.as_flattened_mut(), PANEL));
+        }
+        // SAFETY: the value proves that there are vectors.
+        unsafe { store_rows(to, &sums) };
     }
 }
 
@@ -221,60 +322,158 @@ impl Unit for Amx {
     }
 
     fn multiply(self, block: &[u32], panel: &[u32], to: &mut Target<'_>) {
-        let steps = panel.len() / (TILE * PANEL);
-        assert_eq!(panel.len(), steps * TILE * PANEL, "whole steps");
-        assert_eq!(block.len(), steps * TILE * BLOCK, "as deep as the panel");
-        let mut sums = [[0f32; PANEL]; BLOCK];
-        // SAFETY: the value proves the instructions, `during` has cut the tiles, and both slices
-        // were found to be `steps` long.
-        unsafe { bf16_sums(block.as_ptr(), panel.as_ptr(), steps, &mut sums) };
-        // SAFETY: the value proves that there are vectors.
-        unsafe { store_rows(to, &sums) };
+        self.sum_into(to, |store, whole| sum_panels(block, &[panel], store, whole));
+    }
+
+    fn multiply_stack<'a>(
+        self,
+        block: &[u32],
+        panels: impl Iterator<Item = &'a [u32]>,
+        to: &mut Target<'_>,
+    ) {
+        self.sum_into(to, |store, whole| sum_stack(block, panels, store, whole));
+    }
+
+    fn pack_exponentials(
+        self,
+        scores: &mut [f32],
+        visible: &[usize],
+        block: &mut [u32],
+        sums: &mut [f32],
+    ) {
+        let steps = block.len() / (TILE * BLOCK);
+        let scores = scores.chunks_exact(2 * TILE * steps).zip(visible);
+        for (r, ((scores, visible), sum)) in scores.zip(sums).enumerate() {
+            let first = r / TILE * TILE * TILE + r % TILE * TILE;
+            *sum = self.0.pack_exponentials(&scores[..*visible], first, block);
+        }
     }
 }
 
-/// The 32 by 32 sums of a block and a panel.
+/// Panels that are multiplied by one call of [`bf16_sums`].
+const AT_ONCE: usize = 16;
+
+/// Stores the 32 by 32 sums of a block and panels of one depth that lie below each other, or adds
+/// them.
+fn sum_stack<'a>(
+    block: &[u32],
+    mut panels: impl Iterator<Item = &'a [u32]>,
+    mut store: Store,
+    (to, stride): Whole<'_>,
+) {
+    let mut rest = block;
+    let mut some = [&[][..]; AT_ONCE];
+    loop {
+        let mut n = 0;
+        for (some, panel) in some.iter_mut().zip(panels.by_ref()) {
+            (*some, n) = (panel, n + 1);
+        }
+        let some = &some[..n];
+        let deep = some.first().map_or(0, |panel| panel.len() / PANEL);
+        let (own, after) = rest.split_at(n * deep * BLOCK);
+        sum_panels(own, some, store, (&mut *to, stride));
+        (rest, store) = (after, Store::Add);
+        if n < AT_ONCE {
+            break;
+        }
+    }
+    assert!(rest.is_empty(), "as deep as the panels");
+}
+
+/// The same of at most [`AT_ONCE`] panels; nothing of none.
+#[inline]
+fn sum_panels(block: &[u32], panels: &[&[u32]], store: Store, (to, stride): Whole<'_>) {
+    let Some(first) = panels.first() else { return };
+    let steps = first.len() / (TILE * PANEL);
+    assert!(
+        steps > 0 && first.len() == steps * TILE * PANEL,
+        "whole steps"
+    );
+    assert!(
+        panels.iter().all(|panel| panel.len() == first.len()),
+        "panels of one depth"
+    );
+    assert_eq!(
+        block.len(),
+        panels.len() * steps * TILE * BLOCK,
+        "as deep as the panels"
+    );
+    assert!(to.len() >= (BLOCK - 1) * stride + PANEL, "a whole block");
+    let mut starts = [std::ptr::null(); AT_ONCE];
+    for (start, panel) in starts[..panels.len()].iter_mut().zip(panels) {
+        *start = panel.as_ptr();
+    }
+    // SAFETY: whoever calls this has cut the tiles; block, panels and target were found to be as long
+    // as their shapes, and neither number is 0.
+    unsafe {
+        bf16_sums(
+            block.as_ptr(),
+            (starts.as_ptr(), panels.len(), steps),
+            (to.as_mut_ptr(), 4 * stride, store == Store::Add),
+        );
+    }
+}
+
+/// The 32 by 32 sums of a block and of panels below each other, in f32, or with `is_added` what is
+/// there plus them, in one chain. A step is 16 pairs.
 ///
 /// # Safety
-/// The processor has the instructions, the tiles are cut, and `block` and `panel` have as many
-/// steps: 32 rows of 16 pairs, and 16 rows of 32 pairs.
+/// The processor has the instructions and the tiles are cut. `block` has `n * steps` steps of 32 rows
+/// of 16 pairs, each of the `n` panels `steps` of 16 rows of 32 pairs, both at least 1; `to` has 32
+/// rows of 32 numbers, `stride` bytes apart.
 unsafe fn bf16_sums(
     block: *const u32,
-    panel: *const u32,
-    steps: usize,
-    sums: &mut [[f32; PANEL]; BLOCK],
+    (panels, n, steps): (*const *const u32, usize, usize),
+    (to, stride, is_added): (*mut f32, usize, bool),
 ) {
-    // SAFETY: as the function's; what is written is `sums`, 32 rows of 128 bytes.
+    // SAFETY: as the function's.
     unsafe {
         asm!(
+            "test {is_added}, {is_added}",
+            "jz 2f",
+            "tileloadd tmm0, [{to} + {stride}*1]",
+            "tileloadd tmm1, [{to} + {stride}*1 + 64]",
+            "tileloadd tmm2, [{below} + {stride}*1]",
+            "tileloadd tmm3, [{below} + {stride}*1 + 64]",
+            "jmp 3f",
+            "2:",
             "tilezero tmm0",
             "tilezero tmm1",
             "tilezero tmm2",
             "tilezero tmm3",
-            "test {steps}, {steps}",
-            "jz 3f",
-            "2:",
+            "3:",
+            "mov {panel}, [{panels}]",
+            "mov {left}, {steps}",
+            "4:",
             "tileloadd tmm4, [{block} + {of_tile}*1]",
-            "tileloadd tmm5, [{block} + {of_tile}*1 + 1024]",
             "tileloadd tmm6, [{panel} + {of_panel}*1]",
             "tileloadd tmm7, [{panel} + {of_panel}*1 + 64]",
+            "tileloadd tmm5, [{block} + {of_tile}*1 + 1024]",
             "tdpbf16ps tmm0, tmm4, tmm6",
             "tdpbf16ps tmm1, tmm4, tmm7",
             "tdpbf16ps tmm2, tmm5, tmm6",
             "tdpbf16ps tmm3, tmm5, tmm7",
             "add {block}, 2048",
             "add {panel}, 2048",
-            "dec {steps}",
-            "jnz 2b",
-            "3:",
-            "tilestored [{sums} + {of_panel}*1], tmm0",
-            "tilestored [{sums} + {of_panel}*1 + 64], tmm1",
-            "tilestored [{sums} + {of_panel}*1 + 2048], tmm2",
-            "tilestored [{sums} + {of_panel}*1 + 2112], tmm3",
+            "dec {left}",
+            "jnz 4b",
+            "add {panels}, 8",
+            "dec {n}",
+            "jnz 3b",
+            "tilestored [{to} + {stride}*1], tmm0",
+            "tilestored [{to} + {stride}*1 + 64], tmm1",
+            "tilestored [{below} + {stride}*1], tmm2",
+            "tilestored [{below} + {stride}*1 + 64], tmm3",
             block = inout(reg) block => _,
-            panel = inout(reg) panel => _,
-            steps = inout(reg) steps => _,
-            sums = in(reg) sums.as_mut_ptr(),
+            panels = inout(reg) panels => _,
+            n = inout(reg) n => _,
+            panel = out(reg) _,
+            left = out(reg) _,
+            steps = in(reg) steps,
+            to = in(reg) to,
+            below = in(reg) to.byte_add(TILE * stride),
+            stride = in(reg) stride,
+            is_added = in(reg) usize::from(is_added),
             of_tile = in(reg) TILE_BYTES,
             of_panel = in(reg) PANEL_BYTES,
             out("tmm0") _, out("tmm1") _, out("tmm2") _, out("tmm3") _,

@@ -16,8 +16,9 @@ use rayon::prelude::*;
 
 use crate::gemm::{Mat, MatMut, Store, Threads};
 use crate::panels::PANEL;
+use crate::rows::{exp_shifted_sum, max};
 
-use super::Pairs;
+use super::{Pairs, wide};
 
 /// Inner indices packed at a time: a panel of 32 KB stays in the first-level cache.
 const DEPTH: usize = 512;
@@ -86,6 +87,54 @@ pub(super) trait Unit: Copy + Send + Sync {
     /// Takes `scale` times the product of a block with a panel into `to`; only within
     /// [`Unit::during`].
     fn multiply(self, block: &[u32], panel: &[u32], to: &mut Target<'_>);
+
+    /// The same with panels of one depth that lie below each other.
+    fn multiply_stack<'a>(
+        self,
+        block: &[u32],
+        panels: impl Iterator<Item = &'a [u32]>,
+        to: &mut Target<'_>,
+    ) {
+        let mut rest = block;
+        for panel in panels {
+            let (own, after) = rest.split_at(panel.len() / PANEL * Self::ROWS);
+            self.multiply(own, panel, to);
+            (rest, to.store) = (after, Store::Add);
+        }
+    }
+
+    /// Packs `e^(score - the row's largest)` of the first `visible[row]` scores of every row as a
+    /// block of the left matrix, zeros for the others; `sums` are the sums of the rows before they
+    /// are rounded. `scores` are `[ROWS, depth]`, the depth a multiple of 32; they are overwritten.
+    fn pack_exponentials(
+        self,
+        scores: &mut [f32],
+        visible: &[usize],
+        block: &mut [u32],
+        sums: &mut [f32],
+    ) {
+        let depth = scores.len() / Self::ROWS;
+        let rows = scores.chunks_exact_mut(depth).zip(visible);
+        for ((scores, &visible), sum) in rows.zip(sums) {
+            let (seen, hidden) = scores.split_at_mut(visible);
+            hidden.fill(0.0);
+            *sum = wide(
+                #[inline(always)]
+                || {
+                    let peak = max(seen);
+                    exp_shifted_sum(seen, peak)
+                },
+            );
+        }
+        let weights = Lanes {
+            data: scores,
+            lanes: visible.len(),
+            depth,
+            lane_stride: depth,
+            depth_stride: 1,
+        };
+        self.pack_left(weights, block);
+    }
 }
 
 /// Destination of the product of a block with a panel.

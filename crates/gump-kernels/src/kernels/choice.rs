@@ -229,8 +229,8 @@ fn usable(
 /// of sums in f32.
 #[cfg(target_arch = "x86_64")]
 pub(super) fn is_unit_right<U: bf16::Unit>(unit: U) -> bool {
-    // No multiples of any block, panel or vector.
-    let (m, k, n) = (19, 37, 45);
+    // No multiples of any block, panel or vector, but more than the largest of them.
+    let (m, k, n) = (35, 37, 45);
     let number = |i: usize| i as f32 / 507.0 - 1.0;
     let (a, b) = (numbers(m * k, number), numbers(k * n, number));
     let mut found = vec![0.0; m * n];
@@ -277,11 +277,16 @@ fn are_tiles_right(
 fn are_bytes_right(unit: Amx) -> bool {
     // Two steps of a tile, 64 bytes each.
     const DEPTH: usize = 128;
-    let bytes = numbers(16 * DEPTH, |i| i as u8);
+    let bytes = numbers(32 * DEPTH, |i| i as u8);
     let panel = numbers(DEPTH * PANEL, |i| i as i8);
-    let rows: [&[u8]; 16] = std::array::from_fn(|r| &bytes[r * DEPTH..][..DEPTH]);
-    let (sums, done) = super::amx::Tiles::cut(unit).multiply_bytes(&bytes, &panel);
-    done == DEPTH && sums == portable::byte_tile(rows, &panel)
+    let rows: [&[u8]; 32] = std::array::from_fn(|r| &bytes[r * DEPTH..][..DEPTH]);
+    let exact = portable::byte_tile(rows, &panel);
+    let tiles = super::amx::Tiles::cut(unit);
+    [16, 32].into_iter().all(|n| {
+        let mut sums = [[0; PANEL]; 32];
+        let done = tiles.multiply_bytes(&bytes[..n * DEPTH], &panel, &mut sums[..n]);
+        done == DEPTH && sums[..n] == exact[..n]
+    })
 }
 
 #[cfg(test)]

@@ -1,14 +1,14 @@
 //! Attention over keys and values in bfloat16, by the processor's unit.
 //!
 //! A head's keys of a page are a right matrix of as many columns as the page has tokens, its values
-//! one of as many rows: both are multiplied where they lie. Softmax is in f32. A row's sums are taken
-//! page by page in their order, whatever rows it is multiplied with.
+//! one of as many rows: both are multiplied where they lie. Softmax is in f32, and a row is divided by
+//! its sum after it has been multiplied. A row's sums are taken page by page in their order, whatever
+//! rows it is multiplied with.
 
 use super::bf16::{Lanes, Target, Unit};
 use crate::gemm::Store;
 use crate::half_pages::{HalfHeads, HalfPage, PAGE, Room};
 use crate::panels::PANEL;
-use crate::rows::{exp_shifted_sum, max};
 
 /// As [`crate::half_pages::attend`], by one unit.
 pub(super) fn attend<U: Unit>(
@@ -55,56 +55,47 @@ fn attend_with_head<U: Unit>(
     room: &mut Room,
 ) {
     let (rows, n) = (visible.len(), pages.len() * PAGE);
-    let Room { scores, left } = room;
-    scores.resize(rows * n, 0.0);
+    let Room { scores, sums, left } = room;
+    // A whole block, so that products are stored where they belong; rows beyond the last do not count.
+    scores.resize(U::ROWS * n, 0.0);
     let block = left.room(U::pairs(q.depth) * U::ROWS);
     unit.pack_left(q, block);
     for (p, page) in pages.iter().enumerate() {
         let mut to = Target {
             data: &mut scores[p * PAGE..],
             stride: n,
-            rows,
+            rows: U::ROWS,
             columns: PAGE,
             store: Store::Replace,
             scale: 1.0,
         };
         unit.multiply(block, page.keys(heads, head, U::pairs(q.depth)), &mut to);
     }
-    for (scores, &visible) in scores.chunks_exact_mut(n).zip(visible) {
-        let (seen, hidden) = scores.split_at_mut(visible);
-        hidden.fill(0.0);
-        super::wide(
-            #[inline(always)]
-            || {
-                let peak = max(seen);
-                let reciprocal = 1.0 / exp_shifted_sum(seen, peak);
-                seen.iter_mut().for_each(|weight| *weight *= reciprocal);
-            },
-        );
-    }
-    let weights = Lanes {
-        data: scores,
-        lanes: rows,
-        depth: n,
-        lane_stride: n,
-        depth_stride: 1,
-    };
+    sums.resize(rows, 0.0);
     let block = left.room(U::pairs(n) * U::ROWS);
-    unit.pack_left(weights, block);
+    unit.pack_exponentials(scores, visible, block, sums);
     for panel in 0..heads.value_panels() {
         let first = panel * PANEL;
+        let mut to = Target {
+            data: &mut out[first..],
+            stride: q.lane_stride,
+            rows,
+            columns: PANEL.min(heads.d - first),
+            store: Store::Replace,
+            scale: 1.0,
+        };
         // A page is as deep as a whole number of steps of every unit.
-        let parts = block.chunks_exact(PAGE / 2 * U::ROWS);
-        for (p, (page, block)) in pages.iter().zip(parts).enumerate() {
-            let mut to = Target {
-                data: &mut out[first..],
-                stride: q.lane_stride,
-                rows,
-                columns: PANEL.min(heads.d - first),
-                store: if p == 0 { Store::Replace } else { Store::Add },
-                scale: 1.0,
-            };
-            unit.multiply(block, page.values(heads, head, panel), &mut to);
-        }
+        let values = pages.iter().map(|page| page.values(heads, head, panel));
+        unit.multiply_stack(block, values, &mut to);
     }
+    super::wide(
+        #[inline(always)]
+        || {
+            for (out, sum) in out.chunks_mut(q.lane_stride).zip(&*sums) {
+                let reciprocal = 1.0 / sum;
+                let own = &mut out[..heads.d];
+                own.iter_mut().for_each(|number| *number *= reciprocal);
+            }
+        },
+    );
 }

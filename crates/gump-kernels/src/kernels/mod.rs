@@ -257,7 +257,7 @@ pub(crate) fn byte_tile<const N: usize>(rows: [&[u8]; N], panel: &[i8]) -> [[i32
     portable::byte_tile(rows, panel)
 }
 
-/// Rows that [`ByteTiles`] multiply together: those of a tile of AMX.
+/// Rows that [`ByteTiles`] multiply together, or twice as many: those of a tile of AMX.
 pub(crate) const BYTE_ROWS: usize = 16;
 
 /// Tiles of bytes, which the calling thread holds until they are dropped.
@@ -285,25 +285,28 @@ impl ByteTiles {
         }
     }
 
-    /// [`byte_tile`] of 16 rows one after another: whole tiles by tiles, the rest by vectors.
+    /// [`byte_tile`] of [`BYTE_ROWS`] rows one after another, or of twice as many: whole tiles by
+    /// tiles, the rest by vectors.
     #[cfg(target_arch = "x86_64")]
-    pub(crate) fn multiply(&self, rows: &[u8], panel: &[i8]) -> [[i32; PANEL]; BYTE_ROWS] {
+    pub(crate) fn multiply(&self, rows: &[u8], panel: &[i8], sums: &mut [[i32; PANEL]]) {
         let depth = panel.len() / PANEL;
-        let (mut sums, done) = self.tiles.multiply_bytes(rows, panel);
+        let done = self.tiles.multiply_bytes(rows, panel, sums);
         if done < depth {
-            let rest = std::array::from_fn(|r| &rows[r * depth + done..(r + 1) * depth]);
-            let rest = byte_tile::<BYTE_ROWS>(rest, &panel[done * PANEL..]);
-            for (sums, rest) in sums.iter_mut().zip(&rest) {
-                for (sum, rest) in sums.iter_mut().zip(rest) {
-                    *sum += rest;
+            let tiles = rows.chunks_exact(BYTE_ROWS * depth);
+            for (rows, sums) in tiles.zip(sums.chunks_exact_mut(BYTE_ROWS)) {
+                let rest = std::array::from_fn(|r| &rows[r * depth + done..(r + 1) * depth]);
+                let rest = byte_tile::<BYTE_ROWS>(rest, &panel[done * PANEL..]);
+                for (sums, rest) in sums.iter_mut().zip(&rest) {
+                    for (sum, rest) in sums.iter_mut().zip(rest) {
+                        *sum += rest;
+                    }
                 }
             }
         }
-        sums
     }
 
     #[cfg(not(target_arch = "x86_64"))]
-    pub(crate) fn multiply(&self, _: &[u8], _: &[i8]) -> [[i32; PANEL]; BYTE_ROWS] {
+    pub(crate) fn multiply(&self, _: &[u8], _: &[i8], _: &mut [[i32; PANEL]]) {
         match self.never {}
     }
 }

@@ -342,8 +342,8 @@ fn tiles_have_the_same_bits_on_every_processor() {
 fn bytes_are_summed_exactly() {
     for depth in [4, 44, 64, 132, 256] {
         let panel: Vec<i8> = (0..depth * PANEL).map(|i| (i * 37 % 255) as i8).collect();
-        let all: Vec<u8> = (0..16 * depth).map(|i| (i * 91 % 256) as u8).collect();
-        let rows: [&[u8]; 16] = std::array::from_fn(|r| &all[r * depth..][..depth]);
+        let all: Vec<u8> = (0..32 * depth).map(|i| (i * 91 % 256) as u8).collect();
+        let rows: [&[u8]; 32] = std::array::from_fn(|r| &all[r * depth..][..depth]);
         let plain = portable::byte_tile(rows, &panel);
         let at = |k: usize, j: usize| i32::from(panel[(k / 4 * PANEL + j) * 4 + k % 4]);
         let slow = (0..depth).map(|k| i32::from(rows[3][k]) * at(k, 7));
@@ -360,7 +360,13 @@ fn bytes_are_summed_exactly() {
                 None => eprintln!("skipped: this processor has no avx512"),
             }
             match Amx::detect() {
-                Some(unit) => assert_eq!(ByteTiles::of(unit).multiply(&all, &panel), plain),
+                Some(unit) => {
+                    for n in [BYTE_ROWS, 2 * BYTE_ROWS] {
+                        let mut sums = vec![[1; PANEL]; n];
+                        ByteTiles::of(unit).multiply(&all[..n * depth], &panel, &mut sums);
+                        assert_eq!(sums, plain[..n], "{n} rows");
+                    }
+                }
                 None => eprintln!("skipped: this processor has no amx"),
             }
         }
@@ -428,9 +434,16 @@ fn attention_over_pages_is_that_of_rounded_numbers() {
         })),
         None => eprintln!("skipped: this processor has no amx"),
     }
-    // An odd number of channels, more than a panel of them, and the sizes of the networks.
-    for (n, d) in [(1, 5), (3, 40), (4, 32), (2, 64)] {
-        let (heads, c, tokens, rows) = (HalfHeads { n, d }, n * d, 75, 41);
+    // An odd number of channels, more than a panel of them, the sizes of the networks, and more pages
+    // than are multiplied at once.
+    for (n, d, tokens) in [
+        (1, 5, 75),
+        (3, 40, 75),
+        (4, 32, 75),
+        (2, 64, 75),
+        (1, 33, 600),
+    ] {
+        let (heads, c, rows) = (HalfHeads { n, d }, n * d, 41);
         let (keys, worth) = (values(tokens * c, 1), values(tokens * c, 2));
         let mut pages = vec![HalfPage::new(heads); tokens.div_ceil(PAGE)];
         // Written twice: what was there before does not count.
