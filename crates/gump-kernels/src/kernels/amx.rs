@@ -17,6 +17,7 @@
 use std::arch::asm;
 use std::arch::x86_64::{__cpuid, __cpuid_count, _xgetbv};
 use std::marker::PhantomData;
+use std::mem::MaybeUninit;
 use std::sync::OnceLock;
 
 use super::avx512_bf16::{Avx512Bf16, store_rows};
@@ -273,29 +274,54 @@ impl Drop for Tiles {
     }
 }
 
-/// 32 rows of 32 numbers, so far apart.
-type Whole<'a> = (&'a mut [f32], usize);
-
 impl Amx {
-    /// Lets `sum` store sums, or add them, where they belong if that is a whole block, else beside it.
-    fn sum_into(self, to: &mut Target<'_>, sum: impl FnOnce(Store, Whole<'_>)) {
+    /// Takes the sums of a block and at most [`AT_ONCE`] panels of one depth, one below another, into
+    /// `to`.
+    fn take_sums(self, block: &[u32], panels: &[&[u32]], to: &mut Target<'_>) {
+        let steps = panels.first().map_or(0, |panel| panel.len()) / (TILE * PANEL);
+        let of_panel = steps * TILE * PANEL;
+        assert!(steps > 0, "at least one step");
+        assert!(
+            panels.iter().all(|panel| panel.len() == of_panel),
+            "whole steps"
+        );
+        assert_eq!(
+            block.len(),
+            panels.len() * steps * TILE * BLOCK,
+            "as deep as the panels"
+        );
+        let mut starts = [std::ptr::null(); AT_ONCE];
+        for (start, panel) in starts[..panels.len()].iter_mut().zip(panels) {
+            *start = panel.as_ptr();
+        }
+        let panels = (starts.as_ptr(), panels.len(), steps);
         let is_whole = to.rows == BLOCK && to.columns == PANEL;
-        if is_whole && to.scale == 1.0 {
-            return sum(to.store, (&mut *to.data, to.stride));
+        if is_whole && to.scale == 1.0 && to.store == Store::Replace {
+            assert!(
+                to.data.len() >= (BLOCK - 1) * to.stride + PANEL,
+                "a whole block"
+            );
+            // SAFETY: the value proves the instructions, `during` has cut the tiles, and all slices
+            // were found to be as long as their shapes.
+            unsafe {
+                bf16_sums(
+                    block.as_ptr(),
+                    panels,
+                    (to.data.as_mut_ptr(), 4 * to.stride),
+                )
+            };
+            return;
         }
-        let mut sums = [[0f32; PANEL]; BLOCK];
-        if to.scale == 1.0 {
-            // Sums go on from what is there, as in whole blocks: a row has the same bits in both.
-            if to.store == Store::Add {
-                for (r, sums) in sums.iter_mut().enumerate().take(to.rows) {
-                    sums[..to.columns].copy_from_slice(&to.data[r * to.stride..][..to.columns]);
-                }
-            }
-            sum(to.store, (sums.as_flattened_mut(), PANEL));
-            to.store = Store::Replace;
-        } else {
-            sum(Store::Replace, (sums.as_flattened_mut(), PANEL));
-        }
+        let mut sums = MaybeUninit::<[[f32; PANEL]; BLOCK]>::uninit();
+        // SAFETY: as above; all sums are written.
+        let sums = unsafe {
+            bf16_sums(
+                block.as_ptr(),
+                panels,
+                (sums.as_mut_ptr().cast(), PANEL_BYTES),
+            );
+            sums.assume_init()
+        };
         // SAFETY: the value proves that there are vectors.
         unsafe { store_rows(to, &sums) };
     }
@@ -322,16 +348,27 @@ impl Unit for Amx {
     }
 
     fn multiply(self, block: &[u32], panel: &[u32], to: &mut Target<'_>) {
-        self.sum_into(to, |store, whole| sum_panels(block, &[panel], store, whole));
+        self.take_sums(block, &[panel], to);
     }
 
     fn multiply_stack<'a>(
         self,
         block: &[u32],
-        panels: impl Iterator<Item = &'a [u32]>,
+        mut panels: impl Iterator<Item = &'a [u32]>,
         to: &mut Target<'_>,
     ) {
-        self.sum_into(to, |store, whole| sum_stack(block, panels, store, whole));
+        let mut rest = block;
+        let mut some = [&[][..]; AT_ONCE];
+        while !rest.is_empty() {
+            let mut n = 0;
+            for (some, panel) in some.iter_mut().zip(panels.by_ref()) {
+                (*some, n) = (panel, n + 1);
+            }
+            assert!(n > 0, "panels as deep as the block");
+            let (own, after) = rest.split_at(n * some[0].len() / PANEL * BLOCK);
+            self.take_sums(own, &some[..n], to);
+            (rest, to.store) = (after, Store::Add);
+        }
     }
 
     fn pack_exponentials(
@@ -353,90 +390,21 @@ impl Unit for Amx {
 /// Panels that are multiplied by one call of [`bf16_sums`].
 const AT_ONCE: usize = 16;
 
-/// Stores the 32 by 32 sums of a block and panels of one depth that lie below each other, or adds
-/// them.
-fn sum_stack<'a>(
-    block: &[u32],
-    mut panels: impl Iterator<Item = &'a [u32]>,
-    mut store: Store,
-    (to, stride): Whole<'_>,
-) {
-    let mut rest = block;
-    let mut some = [&[][..]; AT_ONCE];
-    loop {
-        let mut n = 0;
-        for (some, panel) in some.iter_mut().zip(panels.by_ref()) {
-            (*some, n) = (panel, n + 1);
-        }
-        let some = &some[..n];
-        let deep = some.first().map_or(0, |panel| panel.len() / PANEL);
-        let (own, after) = rest.split_at(n * deep * BLOCK);
-        sum_panels(own, some, store, (&mut *to, stride));
-        (rest, store) = (after, Store::Add);
-        if n < AT_ONCE {
-            break;
-        }
-    }
-    assert!(rest.is_empty(), "as deep as the panels");
-}
-
-/// The same of at most [`AT_ONCE`] panels; nothing of none.
-#[inline]
-fn sum_panels(block: &[u32], panels: &[&[u32]], store: Store, (to, stride): Whole<'_>) {
-    let Some(first) = panels.first() else { return };
-    let steps = first.len() / (TILE * PANEL);
-    assert!(
-        steps > 0 && first.len() == steps * TILE * PANEL,
-        "whole steps"
-    );
-    assert!(
-        panels.iter().all(|panel| panel.len() == first.len()),
-        "panels of one depth"
-    );
-    assert_eq!(
-        block.len(),
-        panels.len() * steps * TILE * BLOCK,
-        "as deep as the panels"
-    );
-    assert!(to.len() >= (BLOCK - 1) * stride + PANEL, "a whole block");
-    let mut starts = [std::ptr::null(); AT_ONCE];
-    for (start, panel) in starts[..panels.len()].iter_mut().zip(panels) {
-        *start = panel.as_ptr();
-    }
-    // SAFETY: whoever calls this has cut the tiles; block, panels and target were found to be as long
-    // as their shapes, and neither number is 0.
-    unsafe {
-        bf16_sums(
-            block.as_ptr(),
-            (starts.as_ptr(), panels.len(), steps),
-            (to.as_mut_ptr(), 4 * stride, store == Store::Add),
-        );
-    }
-}
-
-/// The 32 by 32 sums of a block and of panels below each other, in f32, or with `is_added` what is
-/// there plus them, in one chain. A step is 16 pairs.
+/// The 32 by 32 sums of a block and of panels below each other, in f32, in one chain. A step is 16
+/// pairs.
 ///
 /// # Safety
 /// The processor has the instructions and the tiles are cut. `block` has `n * steps` steps of 32 rows
-/// of 16 pairs, each of the `n` panels `steps` of 16 rows of 32 pairs, both at least 1; `to` has 32
-/// rows of 32 numbers, `stride` bytes apart.
+/// of 16 pairs, each of the `n` panels `steps` of 16 rows of 32 pairs, both at least 1; `to` has room
+/// for 32 rows of 32 numbers, `stride` bytes apart.
 unsafe fn bf16_sums(
     block: *const u32,
     (panels, n, steps): (*const *const u32, usize, usize),
-    (to, stride, is_added): (*mut f32, usize, bool),
+    (to, stride): (*mut f32, usize),
 ) {
     // SAFETY: as the function's.
     unsafe {
         asm!(
-            "test {is_added}, {is_added}",
-            "jz 2f",
-            "tileloadd tmm0, [{to} + {stride}*1]",
-            "tileloadd tmm1, [{to} + {stride}*1 + 64]",
-            "tileloadd tmm2, [{below} + {stride}*1]",
-            "tileloadd tmm3, [{below} + {stride}*1 + 64]",
-            "jmp 3f",
-            "2:",
             "tilezero tmm0",
             "tilezero tmm1",
             "tilezero tmm2",
@@ -473,7 +441,6 @@ unsafe fn bf16_sums(
             to = in(reg) to,
             below = in(reg) to.byte_add(TILE * stride),
             stride = in(reg) stride,
-            is_added = in(reg) usize::from(is_added),
             of_tile = in(reg) TILE_BYTES,
             of_panel = in(reg) PANEL_BYTES,
             out("tmm0") _, out("tmm1") _, out("tmm2") _, out("tmm3") _,
