@@ -42,6 +42,7 @@ pub mod networks;
 mod observation;
 pub mod ppo;
 mod prepared_scenario;
+mod route;
 pub mod sac;
 #[cfg(unix)]
 pub mod server;

@@ -8,6 +8,7 @@ use gump_scene::{AgentId, AgentState, Frame, LaneId, LightState, Scenario};
 
 use crate::RlError;
 use crate::observation::Texture;
+use crate::route::extended;
 
 /// Distance from the ego's start within which the road border is prepared, metres to each side: 8 s
 /// at 30 m/s. Beyond it queries give the same results more slowly.
@@ -40,10 +41,13 @@ struct RouteLight {
 impl PreparedScenario {
     /// Prepares a scenario for steps of `dt` seconds.
     ///
+    /// Its route is extended along the straightest lanes to 240 m beyond the end of the ego's log,
+    /// as far as the map goes, so that the route does not tell how far the recorded driver got.
+    ///
     /// # Errors
     /// [`RlError::Scenario`] if it is not valid, [`RlError::TimeStep`] if `dt` is no multiple of
     /// its time step.
-    pub fn new(scenario: Scenario, dt: f64) -> Result<Self, RlError> {
+    pub fn new(mut scenario: Scenario, dt: f64) -> Result<Self, RlError> {
         scenario.validate().map_err(|source| RlError::Scenario {
             id: scenario.id.clone(),
             source,
@@ -55,6 +59,7 @@ impl PreparedScenario {
                 frames: scenario.dt,
             });
         }
+        scenario.route = extended(&scenario);
         let ego = *scenario.present().ego_now();
         let route = scenario
             .route
@@ -98,7 +103,7 @@ impl PreparedScenario {
         Ok(prepared.into())
     }
 
-    /// The scenario as given.
+    /// The scenario, with its route extended as [`PreparedScenario::new`] says.
     pub fn scenario(&self) -> &Scenario {
         &self.scenario
     }
@@ -258,6 +263,16 @@ mod tests {
         assert_eq!(ahead(10.0), Some((28.0, LightState::Red)));
         assert_eq!(ahead(40.0), Some((60.0, LightState::Green)));
         assert_eq!(ahead(101.0), None);
+    }
+
+    #[test]
+    fn the_light_that_the_recorded_driver_waits_for_is_on_the_route() {
+        let text = "lane 1: 0,0 50,0 next 2\nlane 2: 50,0 80,0 next 3\nlane 3: 80,0 400,0\n
+            route 1\nlight 2 red: 49,0\nego vehicle 0: 44,0 heading 0\n";
+        let prepared = prepared(text, 0.5).unwrap();
+        let ahead = prepared.light_ahead(44.0, prepared.logged(0));
+        assert_eq!(ahead, Some((5.0, LightState::Red)));
+        assert_eq!(prepared.route().map(Polyline::length), Some(400.0));
     }
 
     #[test]

@@ -6,12 +6,15 @@
 use std::collections::BTreeMap;
 use std::sync::OnceLock;
 
-use gump_geometry::{BoxIndex, DVec2, PointIndex, Polygon, SegmentIndex, dvec2};
+use gump_geometry::{BoxIndex, DVec2, PointIndex, Polygon, SegmentIndex, angle_difference, dvec2};
 
 use crate::{
     Area, AreaKind, Lane, LaneId, MapError, MapParts, RoadEdge, RoadLine, Roadblock, RoadblockId,
     StopSign, Unstated,
 };
+
+/// Distance into a lane over which its direction is determined, metres. Chosen by hand.
+const LOOK_M: f64 = 10.0;
 
 /// An immutable, indexed map. Share it in an `Arc`, so that its indices are built only once.
 #[derive(Clone, Debug, Default)]
@@ -102,6 +105,20 @@ impl MapGraph {
             .into_iter()
             .flat_map(|lane| &lane.successors)
             .filter_map(|&next| self.lane(next))
+    }
+
+    /// The successor of `lane` that leads straightest on: whose direction 10 m from its start, or at
+    /// its end if that is nearer, is nearest to the direction in which `lane` ends. Of equally
+    /// straight ones the first stated; `None` where the road ends.
+    pub fn straightest_successor(&self, lane: &Lane) -> Option<&Lane> {
+        let end = lane.centerline.pose_at(lane.centerline.length()).heading;
+        let turn = |next: &Lane| {
+            let ahead = LOOK_M.min(next.centerline.length());
+            let direction = next.centerline.pose_at(ahead).heading;
+            angle_difference(direction, end).abs()
+        };
+        let next = self.successors(lane.id);
+        next.min_by(|a, b| turn(a).total_cmp(&turn(b)))
     }
 
     /// The lanes that lead into `id`, in the order stated; none if the lane is unknown.

@@ -2,7 +2,7 @@
 
 use std::f64::consts::FRAC_PI_6;
 
-use gump_geometry::{DVec2, Polyline, Pose, angle_difference, interpolate_angle};
+use gump_geometry::{DVec2, Polyline, Pose, interpolate_angle};
 use gump_scene::{AgentState, Lane, MapGraph};
 
 use crate::behaviour::reach;
@@ -16,8 +16,6 @@ const ON_LANE_M: f64 = 2.5;
 const JOIN_M: f64 = 15.0;
 /// Spacing of points along lanes, metres.
 const STEP_M: f64 = 1.0;
-/// Distance into a lane over which its direction is determined, metres.
-const LOOK_M: f64 = 10.0;
 /// More lanes than this in a row are a loop of lanes without length.
 const MOST_LANES: usize = 100;
 
@@ -116,14 +114,7 @@ pub(super) fn chain(map: &MapGraph, lane: &Lane, metres: f64) -> Option<Polyline
         if length >= metres {
             break;
         }
-        let end = last.centerline.pose_at(last.centerline.length()).heading;
-        let turn = |next: &&Lane| {
-            let ahead = LOOK_M.min(next.centerline.length());
-            let direction = next.centerline.pose_at(ahead).heading;
-            angle_difference(direction, end).abs()
-        };
-        let next = map.successors(last.id);
-        let Some(next) = next.min_by(|a, b| turn(a).total_cmp(&turn(b))) else {
+        let Some(next) = map.straightest_successor(last) else {
             break;
         };
         points.extend(next.centerline.points());
