@@ -58,8 +58,9 @@ pub struct RewardWeights {
     pub progress: f64,
     /// For a collision at the ego's fault.
     pub collision: f64,
-    /// For a collision in which the ego stands or is hit from behind.
-    pub blameless_collision: f64,
+    /// For a collision in which the ego stands or is hit from behind; as `collision` if `None`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub blameless_collision: Option<f64>,
     /// For leaving the road.
     pub off_road: f64,
     /// For exceeding a comfort bound.
@@ -72,7 +73,7 @@ impl Default for RewardWeights {
         Self {
             progress: 0.1,
             collision: -5.0,
-            blameless_collision: -5.0,
+            blameless_collision: None,
             off_road: -5.0,
             discomfort: -0.05,
         }
@@ -206,7 +207,7 @@ impl Rules {
     /// of a second, road edges at the end and about every two metres before it; an episode that
     /// starts in a collision ends with its first step. The horizon and the end of the route
     /// truncate. Between the two frames others move in straight lines; those that `before` lacks
-    /// stand where `after` has them.
+    /// come from where their velocity in `after` says.
     ///
     /// Shape: `action` is `[action_len]` of the dynamics, in [-1, 1].
     pub fn advance(
@@ -234,7 +235,7 @@ impl Rules {
         };
         let moved = ego.pose.position.distance(now.pose.position);
         let progress = (next.along - state.along).clamp(-moved, moved);
-        let contact = contact(&way, before, after, FASTEST * dt);
+        let contact = contact(&way, before, after, dt);
         let (collided, at_fault) = (contact.is_some(), contact == Some(Fault::Ego));
         let stride = n.div_ceil((moved / ROAD_TEST_SPACING).ceil().clamp(1.0, n as f64) as usize);
         let off_road = way
@@ -245,10 +246,11 @@ impl Rules {
         let uncomfortable = next.is_uncomfortable(dt);
 
         let weights = &self.reward;
+        let blameless = weights.blameless_collision.unwrap_or(weights.collision);
         let happened = |weight: f64, it: bool| if it { weight } else { 0.0 };
         next.reward = weights.progress * progress
             + happened(weights.collision, at_fault)
-            + happened(weights.blameless_collision, collided && !at_fault)
+            + happened(blameless, collided && !at_fault)
             + happened(weights.off_road, off_road)
             + happened(weights.discomfort, uncomfortable);
         next.totals.reward += next.reward;
@@ -361,8 +363,8 @@ enum Fault {
 
 /// [`gump_metrics::Collision`] of the ego at any moment of a step, and whose fault: the ego's if it
 /// is to blame for one of several. `way` has the ego at evenly spaced moments, the last of them the
-/// step's end; no agent moves farther than `farthest` metres.
-fn contact(way: &[Agent], before: &Frame, after: &Frame, farthest: f64) -> Option<Fault> {
+/// step's end; the step takes `dt` seconds.
+fn contact(way: &[Agent], before: &Frame, after: &Frame, dt: f64) -> Option<Fault> {
     let own = way[way.len() - 1].oriented_box();
     let from_end = |ego: &Agent| ego.state.pose.position.distance(own.pose.position);
     let own_way = way.iter().map(from_end).fold(0.0, f64::max);
@@ -372,10 +374,18 @@ fn contact(way: &[Agent], before: &Frame, after: &Frame, farthest: f64) -> Optio
         let size = (own.length + own.width + other.length + other.width) / 2.0;
         let distance = own.pose.position.distance_squared(end.position);
         let far = |reach: f64| distance >= reach * reach;
-        if other.id == way[0].id || far(size + own_way + farthest) {
+        if other.id == way[0].id || far(size + own_way + FASTEST * dt) {
             return None;
         }
-        let start = before.agent(other.id).map_or(end, |then| then.state.pose);
+        let appeared = Pose {
+            position: end.position - other.state.velocity * dt,
+            ..end
+        };
+        let start = before
+            .agent(other.id)
+            .map_or(appeared, |then| then.state.pose);
+        // Of the whole step, as is the way between the two poses.
+        let velocity = (end.position - start.position) / dt;
         if far(size + own_way + start.position.distance(end.position)) {
             return None;
         }
@@ -395,7 +405,7 @@ fn contact(way: &[Agent], before: &Frame, after: &Frame, farthest: f64) -> Optio
             touches.then(|| {
                 let other = other.with_state(AgentState {
                     pose: there.pose,
-                    velocity: other.state.velocity,
+                    velocity,
                 });
                 fault(ego, &other)
             })
@@ -434,4 +444,106 @@ fn is_off_road(prepared: &PreparedScenario, ego: &Agent) -> bool {
     OrientedBox::corners(&ego.oriented_box())
         .into_iter()
         .any(is_off)
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "a test fails by panicking")]
+
+    use gump_scene::{AgentId, fixture};
+
+    use super::*;
+
+    const DT: f64 = 0.5;
+
+    /// The contact of an ego that drives from 0 to 5 with what stands at its end as `after` says.
+    fn found(before: &str, after: &str) -> Option<Fault> {
+        let frame = |others: &str| {
+            let text = format!("ego vehicle 0: 5,0 velocity 10,0\n{others}");
+            fixture::scenario(&text).unwrap().present().now().clone()
+        };
+        let [before, after] = [before, after].map(frame);
+        let ego = *after.agent(AgentId(0)).unwrap();
+        let at = |k: usize| {
+            let mut state = ego.state;
+            state.pose.position.x = k as f64;
+            ego.with_state(state)
+        };
+        let way: Vec<Agent> = (1..=5).map(at).collect();
+        contact(&way, &before, &after, DT)
+    }
+
+    #[test]
+    fn who_appears_within_a_step_has_come_from_somewhere() {
+        // Its box crosses the ego's way after a quarter of a second, and is beyond it at the end.
+        let passes = "agent vehicle 1: 4,7 heading 1.5708 velocity 0,20";
+        assert_eq!(found("", passes), Some(Fault::Ego));
+        assert_eq!(found("", "agent vehicle 1: 4,7 heading 1.5708"), None);
+    }
+
+    #[test]
+    fn who_drives_into_the_ego_and_stops_there_is_to_blame() {
+        let before = "agent vehicle 1: -11,0 heading 0 velocity 20,0";
+        assert_eq!(found(before, "agent vehicle 1: 1,0"), Some(Fault::Other));
+        let stands = "agent vehicle 1: 8,0";
+        assert_eq!(found(stands, stands), Some(Fault::Ego));
+    }
+
+    #[test]
+    fn all_collisions_cost_the_same_unless_stated() {
+        let of = |text: &str| toml::from_str::<RewardWeights>(text).unwrap();
+        assert_eq!(of("collision = -15.0").blameless_collision, None);
+        let stated = of("blameless_collision = -3.0");
+        assert_eq!(stated.blameless_collision, Some(-3.0));
+        // A car from behind touches the ego, which drives at 10 m/s.
+        let text = "lane 1: 0,0 400,0\nroute 1\nego vehicle 0: 20,0 velocity 10,0
+            agent vehicle 1: 12,0 velocity 20,0";
+        let prepared = PreparedScenario::new(fixture::scenario(text).unwrap(), DT).unwrap();
+        let reward = |reward: RewardWeights| {
+            let rules = Rules {
+                reward,
+                ..Rules::default()
+            };
+            let next = rules.step(&prepared, &rules.reset(&prepared), &[0.0, 0.0]);
+            let next = next.unwrap();
+            assert!(next.totals.collided && !next.totals.at_fault);
+            next.reward
+        };
+        let weights = RewardWeights {
+            collision: -15.0,
+            ..RewardWeights::default()
+        };
+        assert!((reward(weights) - (0.5 - 15.0)).abs() < 1e-6);
+        let forgiving = RewardWeights {
+            blameless_collision: Some(-1.0),
+            ..weights
+        };
+        assert!((reward(forgiving) - (0.5 - 1.0)).abs() < 1e-6);
+    }
+
+    /// Drives within the given route are as long as without the lanes beyond.
+    #[test]
+    fn what_lies_beyond_the_route_does_not_change_progress_along_it() {
+        let of = |next: &str| {
+            let text = format!(
+                "lane 1: 0,0 60,0 60,40 {next}\nlane 2: 60,40 60,300\nroute 1
+                 ego vehicle 0: 10,1 velocity 6,0"
+            );
+            PreparedScenario::new(fixture::scenario(&text).unwrap(), DT).unwrap()
+        };
+        let [alone, extended] = ["", "next 2"].map(of);
+        let rules = Rules::default();
+        let drive = |prepared: &PreparedScenario| {
+            let mut state = rules.reset(prepared);
+            while state.end.is_none() {
+                let steer = if state.steps < 13 { 0.0 } else { 0.4 };
+                state = rules.step(prepared, &state, &[0.0, steer]).unwrap();
+            }
+            state.totals.progress
+        };
+        let lengths = [&alone, &extended].map(|prepared| prepared.route().unwrap().length());
+        assert_eq!(lengths, [100.0, 360.0]);
+        assert_eq!(drive(&alone), drive(&extended));
+        assert!(drive(&alone) > 30.0);
+    }
 }
