@@ -4,7 +4,7 @@ use std::sync::{Arc, OnceLock};
 
 use gump_geometry::{DVec2, LineIndex, Polyline};
 use gump_metrics::Border;
-use gump_scene::{AgentId, AgentState, Frame, LaneId, LightState, Scenario};
+use gump_scene::{AgentId, AgentState, Frame, LaneId, Light, LightState, Scenario};
 
 use crate::RlError;
 use crate::observation::Texture;
@@ -122,6 +122,14 @@ impl PreparedScenario {
     pub fn logged(&self, step: usize) -> &Frame {
         let last = self.scenario.log.len() - 1;
         &self.scenario.log[(self.scenario.now + step * self.stride).min(last)]
+    }
+
+    /// The recorded lights `elapsed` seconds into the step after `step` steps; the last ones past
+    /// the end of the log.
+    pub(crate) fn lights(&self, step: usize, elapsed: f64) -> &[Light] {
+        let frames = step * self.stride + (elapsed / self.scenario.dt).round() as usize;
+        let last = self.scenario.log.len() - 1;
+        self.scenario.log[(self.scenario.now + frames).min(last)].lights()
     }
 
     /// The log one step before [`PreparedScenario::logged`], if it goes back that far.

@@ -12,7 +12,7 @@ use gump_rl::{
     recorded_drive,
 };
 use gump_rollout::worlds::{ConstantVelocity, Idm};
-use gump_scene::{AgentState, Frame, Rollout, SceneState, Seed, fixture};
+use gump_scene::{AgentId, AgentState, Frame, LightState, Rollout, SceneState, Seed, fixture};
 
 const COAST: [f32; 2] = [0.0, 0.0];
 
@@ -94,6 +94,51 @@ fn leaving_the_road_terminates() {
     let (n, outcome) = until_end(&mut env(&prepared, TrafficSource::Log, 1), &[0.0, 1.0]);
     assert_eq!(outcome.end, End::Terminated(Failure::OffRoad));
     assert!(n < 5 && outcome.totals.off_road, "{n}");
+}
+
+/// A car waits at a light, which turns green after a second of the log.
+#[test]
+fn lights_change_in_every_world_as_they_were_recorded() {
+    let text =
+        format!("{STREET}lane 2: 0,9 400,9\nlight 2 red: 60,9\nagent vehicle 1: 55,9 heading 0");
+    let mut scenario = fixture::scenario(&text).unwrap();
+    let green = scenario.now + 10;
+    for frame in &mut scenario.log[green..] {
+        let mut lights = frame.lights().to_vec();
+        lights[0].state = LightState::Green;
+        *frame = Frame::new(frame.agents().to_vec(), lights);
+    }
+    let prepared = PreparedScenario::prepare([scenario], DT).unwrap();
+    let idm = Idm::default();
+    // Lights after each step, and whether the car has moved in the end.
+    let drive = |traffic, live_lights, nearest| {
+        let config = EnvConfig {
+            live_lights,
+            nearest,
+            autoreset: gump_rl::Autoreset::Disabled,
+            ..config(1)
+        };
+        let mut env = DrivingEnv::new(prepared.clone(), traffic, config).unwrap();
+        env.reset(Seed(0)).unwrap();
+        let mut colours = Vec::new();
+        for _ in 0..8 {
+            env.step(&COAST).unwrap();
+            colours.push(env.frame(0).unwrap().lights()[0].state);
+        }
+        let frame = env.frame(0).unwrap();
+        let place = frame.agent(AgentId(1)).unwrap().state.pose.position;
+        (colours, place.x > 56.0)
+    };
+    let (red, green) = (LightState::Red, LightState::Green);
+    let recorded = [red, green, green, green, green, green, green, green];
+    let (of_log, _) = drive(TrafficSource::Log, true, None);
+    assert_eq!(of_log, recorded);
+    for nearest in [None, Some(1)] {
+        let (of_idm, moved) = drive(TrafficSource::World(&idm), true, nearest);
+        assert!(of_idm == recorded && moved, "{of_idm:?}");
+        let (held, moved) = drive(TrafficSource::World(&idm), false, nearest);
+        assert!(held == [red; 8] && !moved, "{held:?}");
+    }
 }
 
 #[test]

@@ -28,6 +28,10 @@ pub struct EnvConfig {
     /// [`crate::evaluate`] always simulates all.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub nearest: Option<usize>,
+    /// Whether a world that accepts lights is shown the recorded ones of each moment, those of the
+    /// log's last frame past its end. If not, lights are the world's: bare worlds keep those of the
+    /// present. The log always has its own.
+    pub live_lights: bool,
 }
 
 impl Default for EnvConfig {
@@ -40,6 +44,7 @@ impl Default for EnvConfig {
             autoreset: Autoreset::default(),
             sampling: Sampling::default(),
             nearest: None,
+            live_lights: true,
         }
     }
 }

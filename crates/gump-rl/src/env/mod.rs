@@ -69,7 +69,7 @@ impl<'w> DrivingEnv<'w> {
         let n = config.n_envs;
         let observed = || Observed::new(&config.observation, n);
         Ok(Self {
-            others: Others::new(traffic, config.nearest),
+            others: Others::new(traffic, &config),
             sampler: Sampler::new(config.sampling, n, prepared.len()),
             rows: Vec::new(),
             observations: observed(),

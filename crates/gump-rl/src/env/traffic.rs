@@ -3,8 +3,8 @@
 use gump_rollout::{BoxError, Session, Start, WorldModel};
 use gump_scene::{AgentState, Frame};
 
-use super::TrafficSource;
 use super::row::EnvRow;
+use super::{EnvConfig, TrafficSource};
 use crate::{PreparedScenario, RlError, Rules};
 
 /// The other agents of all rows.
@@ -12,13 +12,16 @@ pub(super) struct Others<'w> {
     world: Option<&'w dyn WorldModel>,
     /// As in [`crate::EnvConfig::nearest`].
     nearest: Option<usize>,
+    /// As in [`crate::EnvConfig::live_lights`].
+    live_lights: bool,
     session: Option<Box<dyn Session + 'w>>,
 }
 
 impl<'w> Others<'w> {
-    pub(super) fn new(traffic: TrafficSource<'w>, nearest: Option<usize>) -> Self {
+    pub(super) fn new(traffic: TrafficSource<'w>, config: &EnvConfig) -> Self {
         Self {
-            nearest,
+            nearest: config.nearest,
+            live_lights: config.live_lights,
             world: match traffic {
                 TrafficSource::Log => None,
                 TrafficSource::World(world) => Some(world),
@@ -111,6 +114,13 @@ impl<'w> Others<'w> {
                 .zip(actions.chunks_exact(len))
                 .map(drive)
                 .collect();
+            if self.live_lights {
+                for (i, row) in rows.iter().enumerate() {
+                    let lights = prepared[row.start.scenario].lights(row.state.steps, elapsed);
+                    // A world with lights of its own keeps them, and its agents obey those.
+                    let _ = session.show(i, lights);
+                }
+            }
             frames = session.step(Some(&egos)).map_err(|e| failed(world, e))?;
         }
         check(rows, &frames)?;

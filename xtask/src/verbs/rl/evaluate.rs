@@ -110,7 +110,7 @@ impl Args {
         }
         let (candidates, env) = self.candidates()?;
         let set = PreparedSet::read(run, &self.scenarios, Split::Test, self.limit)?;
-        let worlds = load(run, &self.test_world, &self.sampling)?;
+        let worlds = load(run, &self.test_world, &self.sampling, env.live_lights)?;
         let test = Test {
             candidates: &candidates,
             worlds,
@@ -159,10 +159,11 @@ pub(super) fn load<'a>(
     run: &mut Run,
     names: impl IntoIterator<Item = &'a WorldName>,
     sampling: &Sampling,
+    live_lights: bool,
 ) -> anyhow::Result<Vec<(&'a WorldName, RlWorld)>> {
     let (sampling, device) = (sampling.resolve()?, run.device().clone());
     run.phase("load", |_| {
-        let load = |name| Ok((name, RlWorld::load(&device, name, &sampling)?));
+        let load = |name| Ok((name, RlWorld::load(&device, name, &sampling, live_lights)?));
         names.into_iter().map(load).collect()
     })
 }

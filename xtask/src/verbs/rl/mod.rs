@@ -14,7 +14,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use anyhow::Context as _;
-use gump_engine::SamplingConfig;
+use gump_engine::{LightSource, SamplingConfig};
 use gump_eval::benchmarks::ScenarioSetName;
 use gump_eval::datasets::{self, Manifest, Part, Split};
 use gump_eval::worlds::{World, WorldName};
@@ -123,10 +123,21 @@ enum RlWorld {
 impl RlWorld {
     /// Loads what the world needs.
     ///
-    /// Error: weights that cannot be read or do not fit.
-    fn load(device: &Device, name: &WorldName, sampling: &SamplingConfig) -> anyhow::Result<Self> {
+    /// Error: weights that cannot be read or do not fit, and [`WrongArguments`] for lights that the
+    /// environment would replace.
+    fn load(
+        device: &Device,
+        name: &WorldName,
+        sampling: &SamplingConfig,
+        live_lights: bool,
+    ) -> anyhow::Result<Self> {
         Ok(match name {
             WorldName::Log => Self::Log,
+            _ if live_lights && sampling.lights == LightSource::Hold => {
+                let wrong = "--lights hold: env.live_lights shows the recorded ones, expected \
+                             live_lights = false under [env] in --config";
+                return Err(WrongArguments(wrong.into()).into());
+            }
             _ => Self::Imagined(World::without_log(device, name, sampling)?),
         })
     }

@@ -105,7 +105,7 @@ impl Args {
         let kinds = self.kinds();
         let jobs = self.jobs(run, &kinds, &settings);
         if self.train_only || self.shard == Shard::WHOLE {
-            self.train(run, &jobs)?;
+            self.train(run, &jobs, settings.env.live_lights)?;
         }
         let mut files = Vec::new();
         let mut diverged = Vec::new();
@@ -231,11 +231,16 @@ impl Args {
 
     /// Trains whatever of the shard is not there yet. A policy that diverges leaves a [`DivergenceRecord`], and
     /// the others go on.
-    fn train(&self, run: &mut Run, jobs: &[(&str, Job<'_>)]) -> anyhow::Result<()> {
+    fn train(
+        &self,
+        run: &mut Run,
+        jobs: &[(&str, Job<'_>)],
+        live_lights: bool,
+    ) -> anyhow::Result<()> {
         let set = PreparedSet::read(run, &self.scenarios, Split::Train, None)?;
         run.result("train_set", &set.name)?;
         let trained_in = [&WorldName::Log].into_iter().chain(&self.world);
-        let worlds = load(run, trained_in, &self.sampling)?;
+        let worlds = load(run, trained_in, &self.sampling, live_lights)?;
         let mut trained = Vec::new();
         for (index, (kind, job)) in jobs.iter().enumerate() {
             if !self.shard.holds(index) {
@@ -294,7 +299,7 @@ impl Args {
                 names.push(name);
             }
         }
-        let worlds = load(run, names, &self.sampling)?;
+        let worlds = load(run, names, &self.sampling, settings.env.live_lights)?;
         let test = Test {
             candidates: &candidates,
             worlds,

@@ -130,7 +130,12 @@ impl Args {
         let set = PreparedSet::read(run, &self.scenarios, Split::Train, None)?;
         let device = run.device().clone();
         let world = run.phase("load", |_| {
-            RlWorld::load(&device, &self.train_world, &sampling)
+            RlWorld::load(
+                &device,
+                &self.train_world,
+                &sampling,
+                settings.env.live_lights,
+            )
         })?;
         run.setting("env", settings.env)?;
         match self.algorithm {

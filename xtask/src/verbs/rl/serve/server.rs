@@ -16,10 +16,11 @@ use crate::verbs::rl::{PreparedSet, RlWorld};
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let prepared = PreparedSet::read(run, &self.scenarios, Split::Train, self.limit)?.scenarios;
-        let world = run.phase("load", |run| {
-            RlWorld::load(run.device(), &self.world, &SamplingConfig::default())
-        })?;
         let mut config = EnvConfig::default();
+        let world = run.phase("load", |run| {
+            let sampling = SamplingConfig::default();
+            RlWorld::load(run.device(), &self.world, &sampling, config.live_lights)
+        })?;
         config.rules.horizon = self.horizon;
         if self.prioritized {
             config.sampling = Sampling::prioritized();
