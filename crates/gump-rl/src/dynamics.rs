@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 #[non_exhaustive]
 pub enum Dynamics {
     /// Two numbers, held for the step: acceleration (-1 the hardest braking, 0 none, 1 the hardest
-    /// acceleration) and steering (the share of the sharpest turn possible at this speed, positive
+    /// acceleration; braking ends at rest, for a vehicle that rolls backwards, too) and steering (the share of the sharpest turn possible at this speed, positive
     /// to the left), of a kinematic bicycle.
     Bicycle(BicycleLimits),
     /// Three numbers: the ego's pose after the step, in its own frame, tracked perfectly.
@@ -201,12 +201,15 @@ impl Dynamics {
 impl BicycleLimits {
     /// Metres per second squared, such that the speed stays within its limit.
     fn acceleration(&self, now: &AgentState, share: f64, dt: f64) -> f64 {
-        let wanted = if share < 0.0 {
-            -share * self.min_acceleration
-        } else {
-            share * self.max_acceleration
-        };
         let speed = now.velocity.dot(now.pose.direction());
+        let wanted = if share >= 0.0 {
+            share * self.max_acceleration
+        } else if speed < 0.0 {
+            // Logged egos roll backwards by rounding and noise: they would get ever faster.
+            share * self.min_acceleration
+        } else {
+            -share * self.min_acceleration
+        };
         wanted.min(((self.max_speed - speed) / dt).max(self.min_acceleration))
     }
 
@@ -235,7 +238,9 @@ impl BicycleLimits {
         let distance = offset.x.signum() * offset.length() * stretch;
         let matching_speed = (target.velocity.dot(target.pose.direction()) - speed) / dt;
         let reaching = 2.0 * (distance - speed * dt) / (dt * dt);
-        let acceleration = (matching_speed + reaching) / 2.0;
+        let wanted = (matching_speed + reaching) / 2.0;
+        // Backwards no action makes it faster.
+        let acceleration = if speed < 0.0 { wanted.max(0.0) } else { wanted };
         let share = if acceleration < 0.0 {
             -acceleration / self.min_acceleration
         } else {
@@ -317,6 +322,27 @@ mod tests {
         };
         assert_abs_diff_eq!(turn_after(2.0), 0.2, epsilon = 1e-9);
         assert_abs_diff_eq!(turn_after(10.0), 0.06 * 5.0, epsilon = 1e-9);
+    }
+
+    #[test]
+    fn braking_backwards_ends_at_rest() {
+        let bicycle = Dynamics::default();
+        let mut now = at_speed(-0.4);
+        let start = now.pose.position;
+        for _ in 0..10 {
+            now = bicycle.advance(&now, &[-0.5, 0.0], DT, DT);
+        }
+        assert_eq!(now.velocity.length(), 0.0);
+        // By 2.025 m/s² from 0.4 m/s.
+        assert_abs_diff_eq!(
+            now.pose.position.distance(start),
+            0.16 / 4.05,
+            epsilon = 1e-9
+        );
+        // Who backs up faster and faster is followed as far as possible: at a constant speed.
+        let mut action = [0.0; 2];
+        bicycle.towards(&at_speed(-1.0), &[at_speed(-3.0)], DT, &mut action);
+        assert_eq!(action[0], 0.0);
     }
 
     #[test]
