@@ -47,10 +47,15 @@ impl Adam {
     }
 }
 
+/// The Euclidean norm of a gradient.
+pub fn norm(gradient: &[f32]) -> f64 {
+    let squares: f64 = gradient.iter().map(|&g| f64::from(g) * f64::from(g)).sum();
+    squares.sqrt()
+}
+
 /// Scales a gradient down to the norm `limit` if it is longer; its norm before.
 pub fn clip(gradient: &mut [f32], limit: Option<f64>) -> f64 {
-    let squares: f64 = gradient.iter().map(|&g| f64::from(g) * f64::from(g)).sum();
-    let norm = squares.sqrt();
+    let norm = norm(gradient);
     if let Some(limit) = limit.filter(|&limit| norm > limit) {
         let scale = (limit / norm) as f32;
         for g in gradient {

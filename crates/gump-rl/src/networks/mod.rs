@@ -16,7 +16,7 @@ mod product;
 #[cfg(test)]
 mod conv_net_tests;
 
-pub use adam::{Adam, clip};
+pub use adam::{Adam, clip, norm};
 pub use conv_net::{Architecture, ConvNet, ConvPass, Picture};
 pub use mlp::{Mlp, Pass};
 pub use normalizer::Normalizer;

@@ -23,6 +23,11 @@ impl Normalizer {
         }
     }
 
+    /// Whether this is the identity, which nothing has been fitted to.
+    pub fn is_identity(&self) -> bool {
+        *self == Self::identity(self.shift.len())
+    }
+
     /// Scales the content of the `pieces` to mean 0 and variance 1; constant numbers become 0.
     ///
     /// Shape: `[rows, len]` each.

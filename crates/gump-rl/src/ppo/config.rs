@@ -48,6 +48,8 @@ pub struct PpoConfig {
     pub imitation_steps: usize,
     /// Weight of the imitation loss in every gradient step after that.
     pub imitation_weight: f64,
+    /// Whether this weight falls linearly, to 0 at the end of the run.
+    pub imitation_anneals: bool,
     /// Rounds at the beginning in which only the critic learns: the actor would follow its errors.
     pub critic_rounds: usize,
     /// Rounds between checkpoints. All episodes start anew at each, so that a resumed run equals an
@@ -75,6 +77,7 @@ impl Default for PpoConfig {
             head_gain: 0.01,
             imitation_steps: 4000,
             imitation_weight: 0.0,
+            imitation_anneals: false,
             critic_rounds: 10,
             segment: 50,
         }
@@ -136,7 +139,20 @@ impl PpoConfig {
 
     /// The learning rate of a round (0-based).
     pub fn rate(&self, round: usize) -> f64 {
-        let done = round as f64 / self.rounds.max(1) as f64;
-        self.learning_rate + (self.final_learning_rate - self.learning_rate) * done.min(1.0)
+        let fall = self.final_learning_rate - self.learning_rate;
+        self.learning_rate + fall * self.done(round)
+    }
+
+    /// The weight of the imitation loss in a round (0-based).
+    pub fn imitation_weight_of(&self, round: usize) -> f64 {
+        match self.imitation_anneals {
+            true => self.imitation_weight * (1.0 - self.done(round)),
+            false => self.imitation_weight,
+        }
+    }
+
+    /// The share of the run before a round.
+    fn done(&self, round: usize) -> f64 {
+        (round as f64 / self.rounds.max(1) as f64).min(1.0)
     }
 }

@@ -3,7 +3,7 @@
 use super::PpoConfig;
 use super::round::{Lessons, Round};
 use crate::Actor;
-use crate::networks::{Adam, Mlp, Pass, clip};
+use crate::networks::{Adam, Mlp, Pass, clip, norm};
 
 /// Actor and critic with their optimizers.
 #[derive(Clone, Debug)]
@@ -37,6 +37,10 @@ pub struct PpoUpdate {
     pub entropy: f64,
     /// Negative log density of the experts' actions, nats, mean.
     pub imitation_loss: f64,
+    /// Norm of the gradient of rewards and entropy by the actor's outputs.
+    pub reward_gradient: f64,
+    /// Norm of the gradient of the weighted imitation loss by the actor's outputs.
+    pub imitation_gradient: f64,
 }
 
 /// Rows of a batch.
@@ -46,6 +50,8 @@ pub(super) struct Rows<'a> {
     pub(super) indices: &'a [usize],
     /// Normalized observations and actions of experts.
     pub(super) expert: (&'a [f32], &'a [f32]),
+    /// Weight of the imitation loss.
+    pub(super) imitation_weight: f64,
 }
 
 impl PpoLearner {
@@ -153,29 +159,26 @@ impl PpoLearner {
             } else {
                 -advantage * ratio / n
             };
-            for (_, by) in densities {
-                work.outputs.push((weight * by[0]) as f32);
-                work.outputs.push((weight * by[1]) as f32);
-            }
-        }
-        if config.entropy > 0.0 {
-            // The entropy of a normal distribution is its log standard deviation and a constant.
-            let pairs = work.outputs.chunks_exact_mut(2);
-            for (gradient, of) in pairs.zip(outputs.chunks_exact(2)) {
-                let [lowest, highest] = actor.log_std_bounds;
-                if (lowest..highest).contains(&f64::from(of[1])) {
-                    gradient[1] -= (config.entropy / n) as f32;
-                }
+            for ((_, by), of) in densities.into_iter().zip(row.chunks_exact(2)) {
+                // The entropy of a normal distribution is its log standard deviation and a constant.
+                let by = [weight * by[0], weight * by[1] - config.entropy / n];
+                let by = actor.dimension(of).descent(by);
+                work.outputs.extend(by.map(|by| by as f32));
             }
         }
         let n_shown = (shown.len() / a).max(1) as f64;
         let own = 2 * a * rows.indices.len();
         for (of, &action) in outputs[own..].chunks_exact(2).zip(shown) {
-            let (density, by) = actor.dimension(of).log_density(f64::from(action));
+            let dimension = actor.dimension(of);
+            let (density, by) = dimension.log_density_of_shown(f64::from(action));
             update.imitation_loss -= density / n_shown;
-            let weight = -config.imitation_weight / n_shown;
-            work.outputs.extend(by.map(|by| (weight * by) as f32));
+            let by = by.map(|by| -rows.imitation_weight / n_shown * by);
+            work.outputs
+                .extend(dimension.descent(by).map(|by| by as f32));
         }
+        let (rewarded, imitated) = work.outputs.split_at(own);
+        update.reward_gradient = norm(rewarded);
+        update.imitation_gradient = norm(imitated);
         work.gradient.clear();
         work.gradient.resize(actor.network.parameters().len(), 0.0);
         actor

@@ -94,7 +94,6 @@ fn the_gradient_is_that_of_the_clipped_objective() {
     let config = PpoConfig {
         hidden: vec![8],
         entropy: 0.05,
-        imitation_weight: 0.3,
         clip: 1e9,
         ..config(1)
     };
@@ -153,10 +152,23 @@ fn the_gradient_is_that_of_the_clipped_objective() {
         lessons: &lessons,
         indices: &indices,
         expert: (&expert.0, &expert.1),
+        imitation_weight: 0.3,
     };
     let mut update = PpoUpdate::default();
     let gradient = learner.actor_gradient(&rows, &config, &mut update).to_vec();
     assert_eq!(update.clipped, 0.25);
+    // By the outputs, the gradient of imitation is proportional to its weight, that of rewards is
+    // not affected by it.
+    let mut doubled = PpoUpdate::default();
+    let twice = Rows {
+        imitation_weight: 0.6,
+        ..rows
+    };
+    learner.actor_gradient(&twice, &config, &mut doubled);
+    let ratio = doubled.imitation_gradient / update.imitation_gradient;
+    assert!((ratio - 2.0).abs() < 1e-5, "{ratio}");
+    assert!(update.reward_gradient > 0.0);
+    assert_eq!(doubled.reward_gradient, update.reward_gradient);
     let h = 1e-3f32;
     for (k, found) in gradient.iter().enumerate() {
         let at = |by: f32| {
@@ -276,6 +288,49 @@ fn another_run_goes_on_with_the_policy() {
         next(wider),
         Err(RlError::Parameter { name: "hidden", .. })
     ));
+}
+
+#[test]
+fn observations_are_scaled_once() {
+    let scale = |training: &PpoTraining| training.actor().normalizer().unwrap().clone();
+    let (first, mut env) = learn(Reach, 8, config(4));
+    assert!(!scale(&first).is_identity());
+    let mut on = PpoTraining::continuing(config(4), &first, nothing::<Reach>(), Seed(1)).unwrap();
+    on.segment(&mut env, |_| ControlFlow::Continue(())).unwrap();
+    assert_eq!(scale(&on), scale(&first));
+    // Experts that are not imitated before the first round.
+    let mut experts = ReplayBuffer::new(1, Reach::form(), Reach::ACTION).unwrap();
+    let seen = vec![0.5; Reach::form().len()];
+    experts.push(Transition {
+        observation: seen[..].into(),
+        action: &[0.1; Reach::ACTION],
+        reward: 0.0,
+        next: seen[..].into(),
+        terminated: true,
+    });
+    let without = PpoConfig {
+        imitation_steps: 0,
+        ..config(4)
+    };
+    let mut training = PpoTraining::new(without, experts, Seed(1)).unwrap();
+    training
+        .segment(&mut env, |_| ControlFlow::Continue(()))
+        .unwrap();
+    assert!(!scale(&training).is_identity());
+}
+
+#[test]
+fn imitation_fades_if_asked_to() {
+    let weight = |imitation_anneals, round| {
+        let config = PpoConfig {
+            imitation_weight: 0.2,
+            imitation_anneals,
+            ..config(10)
+        };
+        config.imitation_weight_of(round)
+    };
+    assert_eq!([0, 5, 10].map(|round| weight(false, round)), [0.2; 3]);
+    assert_eq!([0, 5, 10].map(|round| weight(true, round)), [0.2, 0.1, 0.0]);
 }
 
 #[test]

@@ -192,7 +192,7 @@ impl PpoTraining {
         let end = ((self.rounds / segment + 1) * segment).min(rounds);
         env.reset(fork(self.seed, Purpose::Episodes, self.rounds as u64))?;
         self.running = vec![Episode::default(); env.n_envs()];
-        if self.rounds == 0 && self.expert.is_empty() {
+        if self.rounds == 0 && !self.is_scaled() {
             self.fit_normalizer(env)?;
         }
         while self.rounds < end {
@@ -202,6 +202,13 @@ impl PpoTraining {
             }
         }
         Ok(())
+    }
+
+    /// Whether the policy scales observations already, by those of experts or as the run that it
+    /// comes from.
+    fn is_scaled(&self) -> bool {
+        let normalizer = self.actor().normalizer();
+        normalizer.is_none_or(|normalizer| !normalizer.is_identity())
     }
 
     /// Scales observations as an untrained policy sees them.
@@ -233,6 +240,7 @@ impl PpoTraining {
         let estimate = (config.discount, config.lambda);
         let lessons = round.lessons(&self.learner.critic, env.n_envs(), estimate);
         let rate = config.rate(self.rounds);
+        let imitation_weight = config.imitation_weight_of(self.rounds);
         let moves_actor = self.rounds >= config.critic_rounds;
         let mut order: Vec<usize> = (0..round.len()).collect();
         let mut rng = fork(self.seed, Purpose::Order, k).rng();
@@ -242,7 +250,7 @@ impl PpoTraining {
             order.shuffle(&mut rng);
             let mut moved = (0.0, 0.0f64);
             for indices in order.chunks(config.batch) {
-                let imitates = config.imitation_weight > 0.0 && !self.expert.is_empty();
+                let imitates = imitation_weight > 0.0 && !self.expert.is_empty();
                 if imitates && moves_actor {
                     let none = (&self.expert, 0);
                     let shown = (&self.expert, indices.len());
@@ -254,6 +262,7 @@ impl PpoTraining {
                     lessons: &lessons,
                     indices,
                     expert: (&self.batch.observations, &self.batch.actions),
+                    imitation_weight,
                 };
                 let update = self.learner.step(&rows, config, rate, moves_actor);
                 sum = sum + update;
@@ -338,6 +347,8 @@ impl std::ops::Add for PpoUpdate {
             clipped: self.clipped + other.clipped,
             entropy: self.entropy + other.entropy,
             imitation_loss: self.imitation_loss + other.imitation_loss,
+            reward_gradient: self.reward_gradient + other.reward_gradient,
+            imitation_gradient: self.imitation_gradient + other.imitation_gradient,
         }
     }
 }
@@ -350,6 +361,8 @@ impl PpoUpdate {
             clipped: self.clipped / n,
             entropy: self.entropy / n,
             imitation_loss: self.imitation_loss / n,
+            reward_gradient: self.reward_gradient / n,
+            imitation_gradient: self.imitation_gradient / n,
         }
     }
 }

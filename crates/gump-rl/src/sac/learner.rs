@@ -8,10 +8,10 @@ use gump_scene::{Seed, standard_normal};
 
 use super::critics::{Critic, critic_loss, soft_target};
 use super::vision::{Seen, Vision};
-use super::{Batch, SacConfig};
+use super::{Batch, Draw, SacConfig, Squashed};
 use crate::ObservationForm;
 use crate::actor::Actor;
-use crate::networks::{Adam, Pass, clip};
+use crate::networks::{Adam, Pass, clip, norm};
 
 /// Actor, critics and temperature with their optimizers.
 #[derive(Clone, Debug)]
@@ -69,10 +69,8 @@ struct Draws {
     actions: Vec<f32>,
     /// Shape: `[rows]`, nats.
     log_densities: Vec<f64>,
-    /// d action / d outputs. Shape: `[rows * action_len]`.
-    action_by: Vec<[f64; 2]>,
-    /// d log density / d outputs. Shape: as above.
-    log_density_by: Vec<[f64; 2]>,
+    /// The distributions drawn from, and what was drawn. Shape: `[rows * action_len]`.
+    drawn: Vec<(Squashed, Draw)>,
 }
 
 impl Learner {
@@ -296,12 +294,10 @@ impl Learner {
         let outputs = [&mut *now_gradient, &mut *next_gradient];
         for ((values, draws), gradient) in pieces.zip(draws).zip(outputs) {
             let dimensions = gradient.chunks_exact_mut(2).zip(values);
-            let by = draws.action_by.iter().zip(&draws.log_density_by);
-            for ((gradient, value), (action_by, density_by)) in dimensions.zip(by) {
-                for k in 0..2 {
-                    let by_output = alpha * density_by[k] - value * action_by[k];
-                    gradient[k] = (weight * by_output) as f32;
-                }
+            for ((gradient, value), (dimension, draw)) in dimensions.zip(&draws.drawn) {
+                let by = |k| alpha * draw.log_density_by[k] - value * draw.action_by[k];
+                let by = [0, 1].map(|k| weight * by(k));
+                gradient.copy_from_slice(&dimension.descent(by).map(|by| by as f32));
             }
         }
         let (rewarded, imitated) = now_gradient.split_at_mut(2 * own);
@@ -391,21 +387,21 @@ fn draw(actor: &Actor, pass: &Pass, seed: Seed) -> Draws {
     let mut rng = seed.rng();
     let drawn = pass.output().chunks_exact(2).map(|outputs| {
         let noise = standard_normal(&mut rng);
-        actor.dimension(outputs).draw(noise)
+        let dimension = actor.dimension(outputs);
+        (dimension, dimension.draw(noise))
     });
     let drawn: Vec<_> = drawn.collect();
     let rows = drawn.chunks_exact(actor.action_len());
     Draws {
-        actions: drawn.iter().map(|d| d.action as f32).collect(),
+        actions: drawn.iter().map(|(_, d)| d.action as f32).collect(),
         log_densities: rows
-            .map(|row| row.iter().map(|d| d.log_density).sum())
+            .map(|row| row.iter().map(|(_, d)| d.log_density).sum())
             .collect(),
-        action_by: drawn.iter().map(|d| d.action_by).collect(),
-        log_density_by: drawn.iter().map(|d| d.log_density_by).collect(),
+        drawn,
     }
 }
 
-/// Mean negative log density of `actions`; its gradient times `weight` into `gradient`.
+/// Mean negative log density of experts' `actions`; its gradient times `weight` into `gradient`.
 fn imitation_gradient(
     actor: &Actor,
     outputs: &[f32],
@@ -417,11 +413,11 @@ fn imitation_gradient(
     let mut loss = 0.0;
     let dimensions = outputs.chunks_exact(2).zip(gradient.chunks_exact_mut(2));
     for ((outputs, gradient), &action) in dimensions.zip(actions) {
-        let (density, by) = actor.dimension(outputs).log_density(f64::from(action));
+        let dimension = actor.dimension(outputs);
+        let (density, by) = dimension.log_density_of_shown(f64::from(action));
         loss -= density / rows;
-        for k in 0..2 {
-            gradient[k] = (-weight * by[k] / rows) as f32;
-        }
+        let by = dimension.descent(by.map(|by| -weight * by / rows));
+        gradient.copy_from_slice(&by.map(|by| by as f32));
     }
     loss
 }
@@ -447,11 +443,6 @@ fn both<T: Send>(
     let [first, second] = critics;
     let (a, b) = rayon::join(|| work(0, first), || work(1, second));
     [a, b]
-}
-
-fn norm(values: &[f32]) -> f64 {
-    let squares = values.iter().map(|&x| f64::from(x).powi(2));
-    squares.sum::<f64>().sqrt()
 }
 
 fn mean(values: impl Iterator<Item = f64>) -> f64 {

@@ -10,25 +10,30 @@ use std::f64::consts::{LN_2, PI};
 /// before is 7.25: logged actions at a limit would have an infinite one.
 const EDGE: f64 = 1.0 - 1e-6;
 
+/// Farthest from 0 that an expert's action is imitated, where the value before tanh is 2.3: beyond,
+/// an action hardly changes, but the gradient grows with that value. Chosen by hand.
+const SHOWN: f64 = 0.98;
+
 /// The distribution of one component of an action.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Squashed {
     mean: f64,
     log_std: f64,
-    /// 0 where the bounds of the standard deviation hold, else 1.
-    std_moves: f64,
+    /// The network's output, less the nearest value within bounds.
+    beyond: f64,
 }
 
-/// A sample, its density, and their derivatives by the network's outputs.
+/// A sample, its density, and their derivatives; [`Squashed::descent`] makes gradients by the
+/// network's outputs of these.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Draw {
     /// In (-1, 1).
     pub action: f64,
     /// Of the action, nats.
     pub log_density: f64,
-    /// d action / d (mean, raw log standard deviation), with fixed noise.
+    /// d action / d (mean, log standard deviation), with fixed noise.
     pub action_by: [f64; 2],
-    /// d log density / d (mean, raw log standard deviation), with fixed noise.
+    /// d log density / d (mean, log standard deviation), with fixed noise.
     pub log_density_by: [f64; 2],
 }
 
@@ -40,13 +45,20 @@ impl Squashed {
         Self {
             mean: f64::from(mean),
             log_std: clamped,
-            std_moves: if clamped == raw { 1.0 } else { 0.0 },
+            beyond: raw - clamped,
         }
     }
 
     /// The action without exploration: tanh of the mean.
     pub fn mode(&self) -> f64 {
         self.mean.tanh()
+    }
+
+    /// The gradient of a loss by the network's outputs, from that by (mean, log standard deviation):
+    /// where the second output is out of bounds, 0 if descent would carry it farther out.
+    pub fn descent(&self, [by_mean, by_log_std]: [f64; 2]) -> [f64; 2] {
+        let leads_out = self.beyond * by_log_std < 0.0;
+        [by_mean, if leads_out { 0.0 } else { by_log_std }]
     }
 
     /// The action of standard normal `noise`.
@@ -58,19 +70,25 @@ impl Squashed {
         Draw {
             action,
             log_density: log_normal(noise, self.log_std) - log_slope(u),
-            action_by: [slope, slope * spread * self.std_moves],
-            log_density_by: [2.0 * action, (2.0 * action * spread - 1.0) * self.std_moves],
+            action_by: [slope, slope * spread],
+            log_density_by: [2.0 * action, 2.0 * action * spread - 1.0],
         }
     }
 
-    /// Log density of an action, nats, and its gradient by (mean, raw log standard deviation).
+    /// [`Self::log_density`] of an expert's action, taken as at most 0.98 from 0: those at a limit
+    /// of the dynamics would demand means that no gradient of rewards moves away from.
+    pub fn log_density_of_shown(&self, action: f64) -> (f64, [f64; 2]) {
+        self.log_density(action.clamp(-SHOWN, SHOWN))
+    }
+
+    /// Log density of an action, nats, and its gradient by (mean, log standard deviation).
     ///
     /// Actions are taken as at most 1e-6 from the edge, where the density vanishes.
     pub fn log_density(&self, action: f64) -> (f64, [f64; 2]) {
         let u = action.clamp(-EDGE, EDGE).atanh();
         let noise = (u - self.mean) / self.log_std.exp();
         let by_mean = noise / self.log_std.exp();
-        let by_log_std = (noise * noise - 1.0) * self.std_moves;
+        let by_log_std = noise * noise - 1.0;
         let value = log_normal(noise, self.log_std) - log_slope(u);
         (value, [by_mean, by_log_std])
     }
@@ -165,11 +183,26 @@ mod tests {
     }
 
     #[test]
-    fn bounds_of_the_standard_deviation_stop_its_gradient() {
-        let draw = Squashed::new(0.5, 3.0, BOUNDS).draw(-0.2);
-        assert_eq!((draw.action_by[1], draw.log_density_by[1]), (0.0, 0.0));
-        assert!((draw.action - (0.5 - 0.2 * 2.0f64.exp()).tanh()).abs() < 1e-12);
-        let (_, gradient) = Squashed::new(0.5, -30.0, [-5.0, 2.0]).log_density(0.4);
-        assert_eq!(gradient[1], 0.0);
+    fn beyond_the_bounds_only_the_gradient_back_counts() {
+        let wide = Squashed::new(0.5, 3.0, BOUNDS);
+        let action = wide.draw(-0.2).action;
+        assert!((action - (0.5 - 0.2 * 2.0f64.exp()).tanh()).abs() < 1e-12);
+        let narrow = Squashed::new(0.5, -30.0, BOUNDS);
+        let within = Squashed::new(0.5, -1.0, BOUNDS);
+        for (policy, widens, narrows) in
+            [(wide, 0.0, 2.0), (narrow, -2.0, 0.0), (within, -2.0, 2.0)]
+        {
+            // Descent widens by a negative gradient.
+            assert_eq!(policy.descent([3.0, -2.0]), [3.0, widens]);
+            assert_eq!(policy.descent([3.0, 2.0]), [3.0, narrows]);
+        }
+    }
+
+    #[test]
+    fn actions_at_the_edge_are_imitated_as_nearly_there() {
+        let policy = Squashed::new(0.0, 0.0, BOUNDS);
+        let (_, by) = policy.log_density_of_shown(-1.0);
+        assert!((by[0] + 0.98f64.atanh()).abs() < 1e-12, "{by:?}");
+        assert_eq!(policy.log_density_of_shown(0.3), policy.log_density(0.3));
     }
 }

@@ -149,8 +149,8 @@ impl Curves {
             f64::NAN,
             f64::NAN,
             report.learning_rate,
-            f64::NAN,
-            f64::NAN,
+            update.reward_gradient,
+            update.imitation_gradient,
             update.divergence,
             update.clipped,
         ]);
@@ -331,6 +331,7 @@ mod tests {
             env_steps: 64 * round as u64,
             update: PpoUpdate {
                 divergence: 0.01,
+                imitation_gradient: 0.5,
                 ..PpoUpdate::default()
             },
             learning_rate: 1e-4,
@@ -344,6 +345,7 @@ mod tests {
         let cell = |name| read.rows[1][column(name)];
         assert_eq!((cell("env_steps"), cell("episodes")), (128.0, 2.0));
         assert!(cell("divergence") == 0.01 && cell("alpha").is_nan());
+        assert_eq!(cell("imitation_gradient"), 0.5);
     }
 
     #[test]
