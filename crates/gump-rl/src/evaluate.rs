@@ -335,13 +335,17 @@ pub struct Estimate {
     /// Whether the interval resamples policies as well as scenarios, which takes two policies or
     /// more in each group.
     pub over_policies: bool,
+    /// Number of policies of the smallest group.
+    pub n_policies: usize,
 }
 
 /// The mean of `scores`, by policy and scenario, all of them on the same scenarios. `None` if there
 /// is no score, or policies were tested on different numbers of scenarios.
 ///
 /// The interval is a bootstrap of 2000 resamples, each of which draws scenarios and policies with
-/// replacement, independently of each other (Owen 2007, "The pigeonhole bootstrap").
+/// replacement, independently of each other (Owen 2007, "The pigeonhole bootstrap"); of `n` policies
+/// it draws `n - 1`, so that the variance over few of them is not too low by a share of `1 / n`
+/// (Efron 1982, "The Jackknife, the Bootstrap and Other Resampling Plans", section 5.3).
 pub fn estimate(scores: &[Vec<f64>], seed: Seed) -> Option<Estimate> {
     resampled(&[(scores, 1.0)], seed)
 }
@@ -361,10 +365,9 @@ fn resampled(groups: &[(&[Vec<f64>], f64)], seed: Seed) -> Option<Estimate> {
     if n == 0 || !groups.iter().all(fits) {
         return None;
     }
-    let over_policies = groups.iter().all(|(scores, _)| scores.len() > 1);
-    // The first of `drawn` are scenarios, the others policies of each group.
-    let of = |drawn: &[Vec<usize>]| -> f64 {
-        let (scenarios, policies) = (&drawn[0], &drawn[1..]);
+    let n_policies = groups.iter().map(|(scores, _)| scores.len()).min()?;
+    let over_policies = n_policies > 1;
+    let of = |scenarios: &[usize], policies: &[&[usize]]| -> f64 {
         let groups = groups.iter().zip(policies);
         let means = groups.map(|((scores, weight), policies)| {
             let of_policy = |&p: &usize| scenarios.iter().map(|&s| scores[p][s]).sum::<f64>();
@@ -372,21 +375,27 @@ fn resampled(groups: &[(&[Vec<f64>], f64)], seed: Seed) -> Option<Estimate> {
         });
         means.sum::<f64>() / scenarios.len() as f64
     };
-    let n_policies = groups.iter().map(|(scores, _)| scores.len());
-    let sizes: Vec<usize> = std::iter::once(n).chain(n_policies).collect();
+    let of_groups = groups.iter().map(|(scores, _)| scores.len());
+    let sizes: Vec<usize> = std::iter::once(n).chain(of_groups).collect();
     let everyone: Vec<Vec<usize>> = sizes.iter().map(|&n| (0..n).collect()).collect();
-    let statistic = |drawn: &[Vec<usize>]| match over_policies {
-        true => vec![Some(of(drawn))],
-        false => vec![Some(of(&[&drawn[..1], &everyone[1..]].concat()))],
+    let all_policies: Vec<&[usize]> = everyone[1..].iter().map(Vec::as_slice).collect();
+    // The first of `drawn` are scenarios, the others policies of each group.
+    let statistic = |drawn: &[Vec<usize>]| {
+        let policies: Vec<&[usize]> = match over_policies {
+            true => drawn[1..].iter().map(|drawn| &drawn[1..]).collect(),
+            false => all_policies.clone(),
+        };
+        vec![Some(of(&drawn[0], &policies))]
     };
     let found = match n {
         1 => Vec::new(),
         _ => intervals_of_groups(&sizes, N_RESAMPLES, seed, statistic),
     };
     Some(Estimate {
-        mean: of(&everyone),
+        mean: of(&everyone[0], &all_policies),
         interval: found.first().copied().flatten(),
         over_policies,
+        n_policies,
     })
 }
 
@@ -454,7 +463,8 @@ mod tests {
     }
 
     /// Of means of rows and columns without interaction the variance is known: that of the rows
-    /// over their number plus that of the columns over theirs.
+    /// over their number plus that of the columns over theirs; of few rows it is estimated without
+    /// bias.
     #[test]
     fn intervals_are_over_scenarios_and_policies() {
         let of_policy = |p: usize| 0.3 * (p % 2) as f64;
@@ -465,7 +475,8 @@ mod tests {
             let interval = found.interval.unwrap();
             (interval.high - interval.low) / 2.0
         };
-        let expected = |n: f64| 1.96 * (0.15f64.powi(2) / n + 0.1f64.powi(2) / 400.0).sqrt();
+        let of_rows = |n: f64| 0.15f64.powi(2) / (n - 1.0);
+        let expected = |n: f64| 1.96 * (of_rows(n) + 0.1f64.powi(2) / 400.0).sqrt();
         let ten = estimate(&group(10), Seed(1)).unwrap();
         assert!((ten.mean - 0.25).abs() < 1e-9 && ten.over_policies);
         assert!(
@@ -476,10 +487,11 @@ mod tests {
         // Scenarios are paired, so only the policies are left in a difference.
         let difference = estimate_difference(&group(10), &group(10), Seed(1)).unwrap();
         assert_eq!(difference.mean, 0.0);
-        let of_both = 1.96 * (2.0 * 0.15f64.powi(2) / 10.0).sqrt();
+        let of_both = 1.96 * (2.0 * of_rows(10.0)).sqrt();
         assert!((half(difference) / of_both - 1.0).abs() < 0.1);
         let one = estimate(&group(1), Seed(1)).unwrap();
         assert!(!one.over_policies && half(one) < 0.012);
+        assert_eq!((ten.n_policies, one.n_policies), (10, 1));
     }
 
     /// Empty roads of different lengths behind the ego, a recorded ego of constant speed.
