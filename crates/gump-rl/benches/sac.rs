@@ -6,7 +6,7 @@ use gump_scene::Seed;
 use rand::Rng as _;
 
 /// Numbers of an observation: those of the first vector views. Kept, so that times stay comparable;
-/// today's default has 134.
+/// today's default has 164.
 const OBSERVATION: usize = 114;
 
 fn batch(n: usize) -> Batch {

@@ -60,7 +60,8 @@ pub use evaluate::{
 };
 pub use imitation::demonstrations;
 pub use observation::{
-    ObservationForm, ObservationSpec, RASTER_LAYERS, RasterView, VectorView, View, expand, observe,
+    AgentOrder, ObservationForm, ObservationSpec, RASTER_LAYERS, RasterView, VectorView, View,
+    expand, observe,
 };
 pub use prepared_scenario::PreparedScenario;
 pub use vector_env::VectorEnv;

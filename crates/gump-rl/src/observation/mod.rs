@@ -13,7 +13,7 @@ use crate::{EpisodeState, PreparedScenario, RlError};
 pub(crate) use buffer::{Observed, ObservedRow};
 pub use raster::{RASTER_LAYERS, RasterView, expand};
 pub(crate) use raster::{Texture, pack};
-pub use vector::VectorView;
+pub use vector::{AgentOrder, VectorView};
 
 /// The form of an observation.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
