@@ -110,7 +110,8 @@ fn lights_change_in_every_world_as_they_were_recorded() {
     }
     let prepared = PreparedScenario::prepare([scenario], DT).unwrap();
     let idm = Idm::default();
-    // Lights after each step, and whether the car has moved in the end.
+    // Lights after each step, and whether the front of the car, at first 2.6 m before the line, has
+    // passed it in the end.
     let drive = |traffic, live_lights, nearest| {
         let config = EnvConfig {
             live_lights,
@@ -127,17 +128,17 @@ fn lights_change_in_every_world_as_they_were_recorded() {
         }
         let frame = env.frame(0).unwrap();
         let place = frame.agent(AgentId(1)).unwrap().state.pose.position;
-        (colours, place.x > 56.0)
+        (colours, place.x + 2.4 > 60.0)
     };
     let (red, green) = (LightState::Red, LightState::Green);
     let recorded = [red, green, green, green, green, green, green, green];
     let (of_log, _) = drive(TrafficSource::Log, true, None);
     assert_eq!(of_log, recorded);
     for nearest in [None, Some(1)] {
-        let (of_idm, moved) = drive(TrafficSource::World(&idm), true, nearest);
-        assert!(of_idm == recorded && moved, "{of_idm:?}");
-        let (held, moved) = drive(TrafficSource::World(&idm), false, nearest);
-        assert!(held == [red; 8] && !moved, "{held:?}");
+        let (of_idm, passed) = drive(TrafficSource::World(&idm), true, nearest);
+        assert!(of_idm == recorded && passed, "{of_idm:?}");
+        let (held, passed) = drive(TrafficSource::World(&idm), false, nearest);
+        assert!(held == [red; 8] && !passed, "{held:?}");
     }
 }
 
