@@ -6,13 +6,17 @@ use std::fmt::Write as _;
 use std::path::PathBuf;
 
 use gump_eval::results::{self, Entry, MissingShards};
-use gump_rl::{Columns, EpisodeResult, estimate, estimate_difference, score_by_scenario};
+use gump_rl::{Columns, EpisodeResult, Estimate, estimate, estimate_difference, score_by_scenario};
 use gump_scene::Seed;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use super::write;
 use crate::run::Run;
+
+/// Policies from which on an interval over them is not said to be over few: of fewer their variance
+/// is hardly known. Chosen by hand.
+const MANY: usize = 5;
 
 /// Everything that the drives depend on.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -59,6 +63,12 @@ pub(super) struct Policy {
     pub(super) policy: String,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(super) train_world: Option<String>,
+    /// The kind of the policy it began with.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(super) from: Option<String>,
+    /// Digest of the settings it learned with; none as of version 0.1.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(super) settings: Option<String>,
     pub(super) file: PathBuf,
     /// Of the file; none of a fixed rule.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -93,7 +103,11 @@ pub(super) struct DriveRecord {
 struct Group<'a> {
     policy: &'a str,
     train_world: Option<&'a str>,
+    from: Option<&'a str>,
+    settings: Option<&'a str>,
     test_world: &'a str,
+    /// Its name, which no other row of the same test world has.
+    label: String,
     /// Drives of each policy of the group, by scenario.
     drives: Vec<Vec<EpisodeResult>>,
 }
@@ -161,7 +175,7 @@ pub(super) fn report(
             row["diverged"] = json!(of_row.count());
         }
     }
-    let mut warnings = missing_intervals(&rows);
+    let mut warnings = missing_intervals(&groups, &rows);
     warnings.extend(left_out(tested));
     run.result("rows", rows)?;
     run.result("differences", differences(&groups, seed))?;
@@ -175,28 +189,26 @@ pub(super) fn report(
     run.result("scenarios", entries.len())
 }
 
-/// Sentences about rows without an interval, and about those whose interval is over scenarios alone
-/// although they are of policies that learned.
-fn missing_intervals(rows: &[Value]) -> Vec<String> {
+/// Sentences about rows without an interval, about those whose interval is over few policies, and
+/// about those whose interval is over scenarios alone although they are of policies that learned.
+fn missing_intervals(groups: &[Group<'_>], rows: &[Value]) -> Vec<String> {
     let names = |is: &dyn Fn(&Value) -> bool| -> String {
-        let mut names: Vec<String> = Vec::new();
-        for row in rows.iter().filter(|row| is(row)) {
-            let policy = row["policy"].as_str().unwrap_or_default();
-            let world = row["test_world"].as_str().unwrap_or_default();
-            let name = match row["train_world"].as_str() {
-                Some(learned_in) => format!("{policy} in {learned_in} among {world}"),
-                None => format!("{policy} among {world}"),
-            };
-            names.push(name);
-        }
-        names.join(", ")
+        let found = groups.iter().zip(rows).filter(|(_, row)| is(row));
+        let names = found.map(|(group, _)| format!("{} among {}", group.label, group.test_world));
+        names.collect::<Vec<_>>().join(", ")
     };
     let has_score = |row: &Value| row["score"].is_number();
     let single = names(&|row| has_score(row) && row["low"].is_null());
     let alone = names(&|row| {
         row["low"].is_number() && row["policies"] == 1 && row["train_world"].is_string()
     });
+    let few = names(&|row| row["interval_over"] == "scenarios and few policies");
     let mut sentences = Vec::new();
+    if !few.is_empty() {
+        sentences.push(format!(
+            "an interval is over fewer than {MANY} policies, whose variance is hardly known, for {few}"
+        ));
+    }
     if !single.is_empty() {
         sentences.push(format!(
             "an interval takes at least 2 scenarios, found 1, so there is none for {single}"
@@ -248,14 +260,21 @@ fn groups<'a>(tested: &'a Tested, entries: &[Entry<Driven>]) -> Vec<Group<'a>> {
         let first = groups.len();
         for (p, policy) in tested.policies.iter().enumerate() {
             let train_world = policy.train_world.as_deref();
-            let is_it = |g: &Group<'_>| (g.policy, g.train_world) == (&policy.policy, train_world);
+            let (from, settings) = (policy.from.as_deref(), policy.settings.as_deref());
+            let is_it = |g: &Group<'_>| {
+                let found = (g.policy, g.train_world, g.from, g.settings);
+                found == (policy.policy.as_str(), train_world, from, settings)
+            };
             let known = groups[first..].iter().position(is_it);
             let i = first + known.unwrap_or(groups.len() - first);
             if known.is_none() {
                 groups.push(Group {
                     policy: &policy.policy,
                     train_world,
+                    from,
+                    settings,
                     test_world,
+                    label: String::new(),
                     drives: Vec::new(),
                 });
             }
@@ -267,6 +286,13 @@ fn groups<'a>(tested: &'a Tested, entries: &[Entry<Driven>]) -> Vec<Group<'a>> {
             let drives = entries.iter().enumerate().flat_map(of_entry).collect();
             groups[i].drives.push(drives);
         }
+    }
+    let labels: Vec<String> = groups
+        .iter()
+        .map(|group| group.label_among(&groups))
+        .collect();
+    for (group, label) in groups.iter_mut().zip(labels) {
+        group.label = label;
     }
     groups
 }
@@ -285,12 +311,12 @@ fn differences(groups: &[Group<'_>], seed: Seed) -> Vec<Value> {
             };
             differences.push(json!({
                 "test_world": group.test_world,
-                "policy": group.label(),
-                "than": than.label(),
+                "policy": group.label,
+                "than": than.label,
                 "difference": found.mean,
                 "low": found.interval.map(|span| span.low),
                 "high": found.interval.map(|span| span.high),
-                "interval_over": found.interval.map(|_| over(found.over_policies)),
+                "interval_over": found.interval.map(|_| over(&found)),
             }));
         }
     }
@@ -298,10 +324,31 @@ fn differences(groups: &[Group<'_>], seed: Seed) -> Vec<Value> {
 }
 
 impl Group<'_> {
-    fn label(&self) -> String {
-        match self.train_world {
-            Some(world) => format!("{} in {world}", self.policy),
-            None => self.policy.to_owned(),
+    /// What its policies have in common, with their settings if `with_settings`.
+    fn name(&self, with_settings: bool) -> String {
+        let mut name = self.policy.to_owned();
+        for (word, part) in [
+            (" in ", self.train_world),
+            (", settings ", self.settings.filter(|_| with_settings)),
+            (", from ", self.from),
+        ] {
+            if let Some(part) = part {
+                name.push_str(word);
+                name.push_str(part);
+            }
+        }
+        name
+    }
+
+    /// Its name, with its settings if others of the same test world have the same name without.
+    fn label_among(&self, groups: &[Self]) -> String {
+        let name = self.name(false);
+        let same = groups
+            .iter()
+            .filter(|other| other.test_world == self.test_world && other.name(false) == name);
+        match same.count() {
+            0 | 1 => name,
+            _ => self.name(true),
         }
     }
 
@@ -316,10 +363,12 @@ impl Group<'_> {
         let columns = Columns::of(&all);
         let found = estimate(&self.scores(), seed);
         let span = found.and_then(|found| found.interval);
-        let over = span.and(found).map(|found| over(found.over_policies));
+        let over = span.and(found).map(|found| over(&found));
         json!({
             "policy": self.policy,
             "train_world": self.train_world,
+            "from": self.from,
+            "settings": self.settings,
             "test_world": self.test_world,
             "policies": self.drives.len(),
             "episodes": all.len(),
@@ -337,10 +386,11 @@ impl Group<'_> {
 }
 
 /// Units that an interval resamples.
-fn over(policies: bool) -> &'static str {
-    match policies {
-        true => "scenarios and policies",
-        false => "scenarios",
+fn over(found: &Estimate) -> &'static str {
+    match (found.over_policies, found.n_policies < MANY) {
+        (true, true) => "scenarios and few policies",
+        (true, false) => "scenarios and policies",
+        (false, _) => "scenarios",
     }
 }
 
@@ -401,6 +451,8 @@ mod tests {
         Policy {
             policy: policy.into(),
             train_world: train_world.map(str::to_owned),
+            from: None,
+            settings: None,
             file: policy.into(),
             sha256: None,
         }
@@ -476,6 +528,31 @@ mod tests {
     }
 
     #[test]
+    fn policies_of_other_settings_make_rows_of_their_own() {
+        let learned = |settings: &str, from: Option<&str>| Policy {
+            settings: Some(settings.into()),
+            from: from.map(str::to_owned),
+            ..policy("ppo", Some("idm"))
+        };
+        let policies = vec![
+            learned("a", None),
+            learned("b", None),
+            learned("a", None),
+            learned("a", Some("ppo in log")),
+            policy("ppo", Some("idm")),
+        ];
+        let (tested, entries) = (tested(policies, &[]), entries(5, 3));
+        let groups = groups(&tested, &entries);
+        let in_idm = groups.iter().filter(|group| group.test_world == "idm");
+        let sizes: Vec<usize> = in_idm.clone().map(|group| group.drives.len()).collect();
+        assert_eq!(sizes, [2, 1, 1, 1]);
+        let labels: Vec<&str> = in_idm.map(|group| group.label.as_str()).collect();
+        let expected = ["ppo in idm, settings a", "ppo in idm, settings b"];
+        assert_eq!(labels[..2], expected);
+        assert_eq!(labels[2..], ["ppo in idm, from ppo in log", "ppo in idm"]);
+    }
+
+    #[test]
     fn intervals_that_are_not_there_are_said() {
         let policies = |n| vec![policy("sac", Some("log")); n];
         let sentences = |n_policies: usize, n: usize| {
@@ -491,10 +568,13 @@ mod tests {
                     "{row}"
                 );
             }
-            missing_intervals(&rows)
+            missing_intervals(&groups, &rows)
         };
-        assert!(sentences(2, 3).is_empty());
-        let single = sentences(2, 1);
+        assert!(sentences(5, 3).is_empty());
+        let few = sentences(4, 3);
+        let names = "for sac in log among idm, sac in log among model:a";
+        assert!(few.len() == 1 && few[0].ends_with(names), "{few:?}");
+        let single = sentences(5, 1);
         let names = "none for sac in log among model:a, brake among model:a";
         assert!(
             single.len() == 1 && single[0].ends_with(names),
@@ -509,7 +589,7 @@ mod tests {
             "{alone:?}"
         );
         // No drive, no interval to miss.
-        assert!(sentences(2, 0).is_empty());
+        assert!(sentences(5, 0).is_empty());
     }
 
     #[test]

@@ -36,8 +36,9 @@ const SCENARIOS_PER_ROUND: usize = 32;
 /// Arguments of `rl evaluate`.
 #[derive(Debug, Serialize, clap::Args)]
 pub(crate) struct Args {
-    /// Files of policies, or expert, random, constant-speed, brake; those of one algorithm and
-    /// training world, which differ in their seeds, make one row
+    /// Files of policies, or expert, random, constant-speed, brake; those of one algorithm, training
+    /// world and configuration, begun with policies of one kind, differ in their seeds and make one
+    /// row
     #[arg(long, value_name = "FILE", required = true, num_args = 1.., value_delimiter = ',')]
     policy: Vec<PathBuf>,
     /// log, idm, constant-velocity or model:WEIGHTS
@@ -76,6 +77,9 @@ pub(super) struct Candidate {
     /// The algorithm, or the name of a fixed rule.
     policy: String,
     train_world: Option<String>,
+    /// As of [`Notes`].
+    from: Option<String>,
+    settings: Option<String>,
     file: PathBuf,
     /// Of the file; none of a fixed rule.
     sha256: Option<String>,
@@ -344,6 +348,8 @@ impl Candidate {
             let rule = Self {
                 policy: file.display().to_string(),
                 train_world: None,
+                from: None,
+                settings: None,
                 file: file.to_owned(),
                 sha256: None,
                 kind,
@@ -357,6 +363,8 @@ impl Candidate {
         let learned = Self {
             policy: notes.algorithm,
             train_world: Some(notes.train_world),
+            from: notes.from,
+            settings: notes.settings,
             file: file.to_owned(),
             sha256: Some(sha256(&bytes)),
             kind: Kind::Learned(Box::new(actor)),
@@ -368,6 +376,8 @@ impl Candidate {
         Policy {
             policy: self.policy.clone(),
             train_world: self.train_world.clone(),
+            from: self.from.clone(),
+            settings: self.settings.clone(),
             file: self.file.clone(),
             sha256: self.sha256.clone(),
         }
@@ -383,7 +393,7 @@ impl Candidate {
     }
 }
 
-fn sha256(bytes: &[u8]) -> String {
+pub(super) fn sha256(bytes: &[u8]) -> String {
     let digest = Sha256::digest(bytes);
     digest.iter().map(|byte| format!("{byte:02x}")).collect()
 }

@@ -94,6 +94,17 @@ impl Settings {
         };
         *own = steps.unwrap_or(*own);
     }
+
+    /// The first eight hexadecimal digits of the checksum of everything here that a policy of this
+    /// algorithm depends on.
+    fn digest(&self, algorithm: Algorithm) -> anyhow::Result<String> {
+        let learner = match algorithm {
+            Algorithm::Ppo => toml::to_string(&self.ppo)?,
+            _ => toml::to_string(&self.sac)?,
+        };
+        let text = format!("{learner}\n{}", toml::to_string(&self.env)?);
+        Ok(evaluate::sha256(text.as_bytes())[..8].to_owned())
+    }
 }
 
 /// The known keys, from which a near miss is suggested; those of the environment are checked as
@@ -200,18 +211,39 @@ struct Notes {
     train_world: String,
     /// The scenarios it learned on, as the command named them; none as of version 0.1.
     scenes: Option<String>,
+    /// [`Self::kind`] of the run whose policy it began with.
+    from: Option<String>,
+    /// [`Settings::digest`]; none as of version 0.1.
+    settings: Option<String>,
     env: EnvConfig,
 }
 
 impl Notes {
+    /// What policies have in common that differ in their seeds only.
+    fn kind(&self) -> String {
+        let mut kind = format!("{} in {}", self.algorithm, self.train_world);
+        if let Some(settings) = &self.settings {
+            kind.push_str(&format!(", settings {settings}"));
+        }
+        if let Some(from) = &self.from {
+            kind.push_str(&format!(", from {from}"));
+        }
+        kind
+    }
+
     fn to_map(&self) -> anyhow::Result<BTreeMap<String, String>> {
         let mut notes = BTreeMap::from([
             ("algorithm".to_owned(), self.algorithm.clone()),
             ("train_world".to_owned(), self.train_world.clone()),
             ("env".to_owned(), toml::to_string(&self.env)?),
         ]);
-        let scenes = self.scenes.clone();
-        notes.extend(scenes.map(|scenes| ("scenes".to_owned(), scenes)));
+        for (key, note) in [
+            ("scenes", &self.scenes),
+            ("from", &self.from),
+            ("settings", &self.settings),
+        ] {
+            notes.extend(note.clone().map(|note| (key.to_owned(), note)));
+        }
         Ok(notes)
     }
 
@@ -226,6 +258,8 @@ impl Notes {
             algorithm: get("algorithm")?,
             train_world: get("train_world")?,
             scenes: notes.get("scenes").cloned(),
+            from: notes.get("from").cloned(),
+            settings: notes.get("settings").cloned(),
             env: toml::from_str(&env)
                 .map_err(|error| anyhow::anyhow!("its environment: {}", error.message()))?,
         })
@@ -266,6 +300,19 @@ mod tests {
     }
 
     #[test]
+    fn settings_have_a_digest_per_algorithm() {
+        let mut settings = Settings::default();
+        let of = |settings: &Settings, algorithm| settings.digest(algorithm).unwrap();
+        let [sac, ppo] = [Algorithm::Sac, Algorithm::Ppo].map(|a| of(&settings, a));
+        assert_ne!(sac, ppo);
+        settings.ppo.discount = 0.5;
+        assert_eq!(of(&settings, Algorithm::Sac), sac);
+        assert_ne!(of(&settings, Algorithm::Ppo), ppo);
+        settings.env.rules.reward.collision = -7.0;
+        assert_ne!(of(&settings, Algorithm::Sac), sac);
+    }
+
+    #[test]
     fn wrong_keys_are_named() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("c.toml");
@@ -290,12 +337,21 @@ mod tests {
             algorithm: "sac".into(),
             train_world: "model:a.safetensors".into(),
             scenes: Some("a.tfrecord".into()),
+            from: Some("ppo in log, settings 0a1b2c3d".into()),
+            settings: Some("00112233".into()),
             env: EnvConfig::default(),
         };
         let found = Notes::from_map(&notes.to_map().unwrap()).unwrap();
         assert_eq!(found.env, notes.env);
         assert_eq!(found.train_world, notes.train_world);
         assert_eq!(found.scenes, notes.scenes);
+        assert_eq!(found.from, notes.from);
+        assert_eq!(found.settings, notes.settings);
+        let mut old = notes.to_map().unwrap();
+        old.remove("from");
+        old.remove("settings");
+        let found = Notes::from_map(&old).unwrap();
+        assert_eq!(found.kind(), "sac in model:a.safetensors");
         assert!(Notes::from_map(&BTreeMap::new()).is_err());
     }
 }

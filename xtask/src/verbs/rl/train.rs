@@ -87,6 +87,15 @@ pub(super) struct Place<'a> {
     pub(super) prepared: &'a Arc<[PreparedScenario]>,
 }
 
+/// The kind of a stored run.
+///
+/// Error: a file that holds none.
+fn kind_of(path: &Path) -> anyhow::Result<String> {
+    let in_file = || path.display().to_string();
+    let (_, notes) = Actor::from_bytes(&read(path)?).with_context(in_file)?;
+    Ok(Notes::from_map(&notes).with_context(in_file)?.kind())
+}
+
 /// A run that ended because a number was not finite.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
@@ -182,13 +191,16 @@ impl Job<'_> {
         self.folder.join("checkpoint.safetensors")
     }
 
-    fn notes(&self) -> Notes {
-        Notes {
+    /// The notes of a run that began with a policy of the kind `from`.
+    fn notes(&self, from: Option<String>) -> anyhow::Result<Notes> {
+        Ok(Notes {
             algorithm: self.algorithm.to_string(),
             train_world: self.world_name.clone(),
             scenes: Some(self.scenes.clone()),
+            from,
+            settings: Some(self.settings.digest(self.algorithm)?),
             env: self.settings.env,
-        }
+        })
     }
 
     /// Whether the run in the folder has made all of its steps.
@@ -199,7 +211,7 @@ impl Job<'_> {
         if !checkpoint.exists() {
             return Ok(false);
         }
-        let found = self.resumed(&checkpoint, &self.notes())?;
+        let (found, _) = self.resumed(&checkpoint)?;
         let (here, there) = (self.seed.0, found.seed().0);
         if here != there {
             let folder = self.folder.display();
@@ -213,13 +225,14 @@ impl Job<'_> {
     ///
     /// Error: [`Diverged`], an error of the environment, or a folder whose run cannot be resumed.
     pub(super) fn execute(&self, run: &Run, place: Place<'_>) -> anyhow::Result<Trained> {
-        let notes = self.notes();
-        let mut training = if self.resume {
-            self.resumed(&self.checkpoint(), &notes)?
+        let (mut training, notes) = if self.resume {
+            self.resumed(&self.checkpoint())?
         } else {
             let experts = demonstrations(place.prepared, &self.settings.env)?;
             let from = self.from.as_deref();
-            Learner::new(self.algorithm, self.settings, experts, self.seed, from)?
+            let notes = self.notes(from.map(kind_of).transpose()?)?;
+            let training = Learner::new(self.algorithm, self.settings, experts, self.seed, from)?;
+            (training, notes)
         };
         let window = (training.segment_len() / POINTS_PER_SEGMENT).max(1);
         let mut curves = if self.resume {
@@ -229,7 +242,7 @@ impl Job<'_> {
         };
         let (steps, env_steps) = (training.steps(), training.env_steps());
         let began = Instant::now();
-        self.learn(run, place, &mut training, &mut curves)?;
+        self.learn(run, place, &notes, (&mut training, &mut curves))?;
         let seconds = began.elapsed().as_secs_f64();
         let gain = curves.gain();
         let n_env_steps = training.env_steps();
@@ -252,12 +265,13 @@ impl Job<'_> {
         })
     }
 
-    /// The run in the folder, if it has the requested settings.
-    fn resumed(&self, checkpoint: &Path, notes: &Notes) -> anyhow::Result<Learner> {
+    /// The run in the folder, if it has the requested settings, and its notes.
+    fn resumed(&self, checkpoint: &Path) -> anyhow::Result<(Learner, Notes)> {
         let bytes = read(checkpoint)?;
         let in_file = || checkpoint.display().to_string();
         let (_, found) = Actor::from_bytes(&bytes).with_context(in_file)?;
         let found = Notes::from_map(&found).with_context(in_file)?;
+        let notes = self.notes(found.from)?;
         for (flag, requested, begun) in [
             ("--algorithm", &notes.algorithm, &found.algorithm),
             ("--train-world", &notes.train_world, &found.train_world),
@@ -278,15 +292,15 @@ impl Job<'_> {
             let wrong = "--config: the run to resume began with another configuration";
             return Err(WrongArguments(wrong.into()).into());
         }
-        Ok(training)
+        Ok((training, notes))
     }
 
     fn learn(
         &self,
         run: &Run,
         place: Place<'_>,
-        training: &mut Learner,
-        curves: &mut Curves,
+        notes: &Notes,
+        (training, curves): (&mut Learner, &mut Curves),
     ) -> anyhow::Result<()> {
         let total = training.total();
         let label = format!("{} in {}", self.algorithm, self.world_name);
@@ -310,7 +324,7 @@ impl Job<'_> {
             );
             let is_last = training.steps() >= total.min(self.stop_at);
             if is_last || saved.elapsed() > CHECKPOINT_EVERY {
-                self.write(training, curves, saved_step)?;
+                self.write(training, notes, curves, saved_step)?;
                 (saved, saved_step) = (Instant::now(), Some(training.steps()));
             }
         }
@@ -322,10 +336,11 @@ impl Job<'_> {
     fn write(
         &self,
         training: &Learner,
+        notes: &Notes,
         curves: &Curves,
         saved_step: Option<usize>,
     ) -> anyhow::Result<()> {
-        let notes = self.notes().to_map()?;
+        let notes = notes.to_map()?;
         let run = training.to_bytes(&notes);
         let run = run.map_err(|error| self.ended(error, saved_step))?;
         curves.write(&self.folder)?;
