@@ -67,8 +67,9 @@ const RUNS_MPS: f64 = 4.0;
 /// Draws the moves of agents, given by index, again for an attempt.
 pub(super) type Again<'a> = dyn FnMut(&[usize], usize) -> Vec<Pose> + 'a;
 
-/// The limits of a move, in the frame of the agent that makes it.
-pub(super) fn kinematically_limited(now: &Shown, step: Pose) -> Pose {
+/// The move nearest to one that an agent can make, both in its own frame: what it drives on grips and
+/// does not slide, and nobody on foot speeds up beyond a run. Training holds free drives to the same.
+pub fn kinematically_limited(now: &Shown, step: Pose) -> Pose {
     if now.body.kind == AgentKind::Pedestrian {
         return at_a_run(now, step);
     }

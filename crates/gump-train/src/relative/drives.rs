@@ -19,7 +19,7 @@ use gump_engine::relative::approach::before_line;
 use gump_engine::relative::engine::{Draw, RelativeEngine, Workspace};
 use gump_engine::relative::keep_clear::closed_entry;
 use gump_engine::relative::right_of_way::{Course, courses, yielding_speed};
-use gump_engine::relative::rules::resolve;
+use gump_engine::relative::rules::{kinematically_limited, resolve};
 use gump_engine::relative::seen::{FrameIndex, ObservedAgent, add_presents};
 use gump_geometry::{DVec2, Pose, angle_difference};
 use gump_kernels::panels::Precision;
@@ -63,6 +63,10 @@ const LINE_ASIDE_M: f64 = 6.0;
 const ENTRY_M: f64 = 40.0;
 /// A move with a fault is drawn again so many times. Chosen by hand.
 const FAULT_REDRAWS: usize = 6;
+/// A fault is none up to this, metres per second: rounding.
+const NO_FAULT: f64 = 1e-6;
+/// Moves are the same up to this, metres and radians: rounding; bins are a thousand times as wide.
+const SAME: f64 = 1e-6;
 /// Radius around a sample in which road edges are considered, metres. Chosen by hand.
 const EDGES_M: f64 = 150.0;
 /// Separates the choice of how a sample is driven from its draws.
@@ -113,6 +117,14 @@ pub struct RelativeDrives {
     /// that has been green for a second: a network that misses its start has never seen that, and stands
     /// on (docs/results/0047-missed-starts.md). Above 0, to slow down before a green light is a fault, too.
     pub held: f64,
+    /// Whether moves in those samples are held to what rollouts under rules do with them. Without it what
+    /// rollouts forbid becomes a target there. With it (a) moves that tyres, steering or legs do not allow
+    /// are limited (`gump_engine::relative::rules::kinematically_limited`), and count as changed; (b) no
+    /// redraw that clears others has a greater fault than the move before, unless it is slower; (c) a
+    /// vehicle all draws of which are faulty brakes where it is too fast for a bend, a light, a sign or
+    /// others' right of way, and a move that still has a fault has no weight. False by default, as in the
+    /// trainings of all published weights.
+    pub limits: bool,
     /// Agents that are added to those samples.
     pub crowd: Crowd,
 }
@@ -132,6 +144,7 @@ impl Default for RelativeDrives {
             top_p: 0.95,
             unchanged: 1.0,
             held: 0.0,
+            limits: false,
             crowd: Crowd::default(),
         }
     }
@@ -185,6 +198,30 @@ type Fault<'a> = dyn Fn(usize, &Pose) -> f64 + 'a;
 
 /// The move of an agent that has drawn none without a fault, if there is one that drivers make.
 type WayOut<'a> = dyn Fn(usize) -> Option<Pose> + 'a;
+
+/// The same move of an agent that brakes, if it is too fast for what is ahead.
+type Braked<'a> = dyn Fn(usize, &Pose) -> Option<Pose> + 'a;
+
+/// What judges moves, and makes those that nobody has drawn.
+#[derive(Clone, Copy)]
+struct Judge<'a> {
+    fault: &'a Fault<'a>,
+    way_out: &'a WayOut<'a>,
+    braked: &'a Braked<'a>,
+}
+
+/// Where a move under the rules comes from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Origin {
+    /// The log has it.
+    Log,
+    /// It is the network's first draw.
+    FirstDraw,
+    /// It was drawn again, limited or braked.
+    Changed,
+    /// It is no move that drivers make, but no better one was found.
+    Faulty,
+}
 
 /// A snapshot of the network at a step, which drives.
 pub(crate) struct NetworkDriver {
@@ -344,12 +381,16 @@ impl TrackDriver for NetworkDriver {
                     }
                 };
                 let way_out = |i: usize| roads[i].starts(&agents[i], || has_room(i));
-                let judge = (&fault as &Fault<'_>, &way_out as &WayOut<'_>);
+                let judge = Judge {
+                    fault: &fault,
+                    way_out: &way_out,
+                    braked: &|i: usize, step: &Pose| roads[i].braked(&agents[i], step),
+                };
                 let ground = (lane_map, judge);
                 let moves = self.moves_by_the_rules(crowd, ground, &hidden, seed, &mut room);
                 let held = self.config.held;
                 let each = here.iter().zip(&agents).zip(moves).enumerate();
-                for (i, ((&a, now), (step, is_unchanged))) in each {
+                for (i, ((&a, now), (step, origin))) in each {
                     if let Some(next) = tracks[a].states[t + 1].as_mut().filter(|_| !stays[a]) {
                         let starts = step.position.length() > CREEPS_M
                             && given[i].is_none()
@@ -358,9 +399,10 @@ impl TrackDriver for NetworkDriver {
                             *next = next.held_at(now.pose, now.pose * step);
                             continue;
                         }
-                        let weight = match is_unchanged {
-                            true => self.config.unchanged,
-                            false => 1.0,
+                        let weight = match origin {
+                            Origin::Log | Origin::Changed => 1.0,
+                            Origin::FirstDraw => self.config.unchanged,
+                            Origin::Faulty => 0.0,
                         };
                         *next = next.led_to(now.pose * step, weight);
                     }
@@ -389,21 +431,22 @@ impl TrackDriver for NetworkDriver {
 
 impl NetworkDriver {
     /// A move of every agent in its own frame, redrawn where it has a fault and where the rules
-    /// forbid it; some are given. With each, whether it is the network's first draw.
+    /// forbid it; some are given. With each, where it comes from.
     fn moves_by_the_rules(
         &self,
         (agents, given): (&[Shown], &[Option<Pose>]),
-        (lane_map, (fault, way_out)): (&LaneMap, (&Fault<'_>, &WayOut<'_>)),
+        (lane_map, judge): (&LaneMap, Judge<'_>),
         hidden: &[f32],
         seed: Seed,
         room: &mut Workspace,
-    ) -> Vec<(Pose, bool)> {
+    ) -> Vec<(Pose, Origin)> {
+        let (fault, limits) = (judge.fault, self.config.limits);
         let draw = Draw {
             temperature: self.config.temperature,
             top_p: self.config.top_p,
         };
         let c = hidden.len() / agents.len().max(1);
-        let mut drawn = |who: &[usize], attempt: usize| -> Vec<Pose> {
+        let mut raw = |who: &[usize], attempt: usize| -> Vec<Pose> {
             let rows: Vec<f32> = who
                 .iter()
                 .flat_map(|&i| &hidden[i * c..][..c])
@@ -417,9 +460,17 @@ impl NetworkDriver {
                 .map(|(&i, bins)| given[i].unwrap_or_else(|| dequantize(bins)))
                 .collect()
         };
+        let possible = |i: usize, step: Pose| match limits && given[i].is_none() {
+            true => limited(&agents[i], step),
+            false => step,
+        };
         let all: Vec<usize> = (0..agents.len()).collect();
-        let mut moves = drawn(&all, 0);
-        let first = moves.clone();
+        let first = raw(&all, 0);
+        let mut moves: Vec<Pose> = all.iter().map(|&i| possible(i, first[i])).collect();
+        let mut drawn = |who: &[usize], attempt: usize| -> Vec<Pose> {
+            let steps = who.iter().zip(raw(who, attempt));
+            steps.map(|(&i, step)| possible(i, step)).collect()
+        };
         let faults = all.iter().map(|&i| (i, fault(i, &moves[i])));
         let mut faulty: Vec<(usize, f64)> = faults.filter(|(_, fault)| *fault > 0.0).collect();
         for attempt in 0..FAULT_REDRAWS {
@@ -432,11 +483,32 @@ impl NetworkDriver {
             }
             faulty.retain(|(_, least)| *least > 0.0);
         }
-        for (i, least) in faulty {
-            let out = way_out(i).filter(|step| fault(i, step) < least);
-            moves[i] = out.unwrap_or(moves[i]);
+        let mut is_lost = vec![false; agents.len()];
+        for (i, mut least) in faulty {
+            let brakes = match limits {
+                true => (judge.braked)(i, &moves[i]),
+                false => None,
+            };
+            for step in (judge.way_out)(i).into_iter().chain(brakes) {
+                let found = fault(i, &step);
+                if found < least {
+                    (moves[i], least) = (step, found);
+                }
+            }
+            is_lost[i] = limits && least > NO_FAULT;
         }
-        let mut again = |who: &[usize], attempt: usize| drawn(who, attempt + 1);
+        // As in rollouts: redraws that keep agents clear of others must not make them run a light. One that
+        // can do nothing else may at least be slower.
+        let before = moves.clone();
+        let mut again = |who: &[usize], attempt: usize| -> Vec<Pose> {
+            let mut steps = drawn(who, attempt + 1);
+            for (&i, step) in who.iter().zip(&mut steps) {
+                if limits && is_worse(|step| fault(i, step), step, &before[i]) {
+                    *step = before[i];
+                }
+            }
+            steps
+        };
         let redraws = self.config.redraws;
         resolve(
             agents,
@@ -446,9 +518,14 @@ impl NetworkDriver {
             &mut moves,
             &mut again,
         );
-        let all = moves.into_iter().zip(&first).zip(given);
-        all.map(|((step, first), given)| (step, given.is_none() && step == *first))
-            .collect()
+        let origin = |i: usize, step: &Pose| match given[i] {
+            Some(_) => Origin::Log,
+            None if is_lost[i] && fault(i, step) > NO_FAULT => Origin::Faulty,
+            None if *step == first[i] => Origin::FirstDraw,
+            None => Origin::Changed,
+        };
+        let moves = moves.into_iter().enumerate();
+        moves.map(|(i, step)| (step, origin(i, &step))).collect()
     }
 
     /// The candidates' moves of all agents, in the agents' frames.
@@ -464,6 +541,22 @@ impl NetworkDriver {
             bins.into_iter().map(dequantize).collect()
         });
         candidates.collect()
+    }
+}
+
+/// Whether a move is no slower than the one before, and has a greater fault.
+pub(super) fn is_worse(fault: impl Fn(&Pose) -> f64, step: &Pose, before: &Pose) -> bool {
+    let is_slower = step.position.length() < before.position.length();
+    !is_slower && fault(step) > fault(before) + NO_FAULT
+}
+
+/// A drawn move within the limits of rollouts; exactly as drawn if it is within them.
+fn limited(now: &Shown, step: Pose) -> Pose {
+    let kept = kinematically_limited(now, step);
+    let turned = angle_difference(kept.heading, step.heading).abs();
+    match kept.position.distance(step.position).max(turned) > SAME {
+        true => kept,
+        false => step,
     }
 }
 

@@ -174,6 +174,19 @@ impl<'a> Road<'a> {
         starts.then_some(Pose::new(STARTS_M, 0.0, 0.0))
     }
 
+    /// The same move of a vehicle that is too fast for a bend, a light, a sign or others' right of way:
+    /// it brakes as rollouts under rules do where nothing else is drawn.
+    pub(super) fn braked(&self, now: &Shown, step: &Pose) -> Option<Pose> {
+        let speed = now.velocity().length();
+        let most = self.most.max(speed - BRAKES_MPS) * TOKEN_DT;
+        let length = step.position.length();
+        let is_fast = self.drives && length > most;
+        is_fast.then(|| match most <= CREEPS_M {
+            true => Pose::IDENTITY,
+            false => Pose::IDENTITY.interpolate(*step, most / length),
+        })
+    }
+
     /// Whether a vehicle at this speed has nothing to slow down for, or to stand for.
     fn is_free(&self, speed: f64, has_room: impl Fn() -> bool) -> bool {
         let stands = speed * TOKEN_DT <= CREEPS_M;
@@ -671,6 +684,42 @@ mod tests {
         // Far enough away, or slow enough; and slowing down early is none either.
         assert!(at(10.0, (14.0, 14.0)) == 0.0 && at(40.0, (8.0, 8.0)) == 0.0);
         assert_eq!(at(20.0, (14.0, 13.0)), 0.0);
+    }
+
+    #[test]
+    fn who_is_too_fast_for_what_is_ahead_brakes_without_a_fault() {
+        let map = streets("lane 1: 0,0 60,0 next 2\nlane 2: 60,0 120,0");
+        let braked = |colour: LightState, (speed, next): (f64, f64)| {
+            let now = Shown::first(BODY, Pose::new(39.75, 0.0, 0.0), dvec2(speed, 0.0));
+            let by_lane = vec![(LaneId(2), colour, None)];
+            let lights = Lights { by_lane };
+            let road = Road::ahead_of(&now, false, &map, &lights);
+            let step = Pose::new(next * TOKEN_DT, 0.0, 0.0);
+            let before = road.fault(&now, &step, None, || false);
+            let step = road.braked(&now, &step)?;
+            let after = road.fault(&now, &step, None, || false);
+            Some((
+                step.position.length() / TOKEN_DT,
+                before > 1.0 && after < 1e-9,
+            ))
+        };
+        // 18 m before the line: 10.4 m/s are the most, or what 4 m/s² leave.
+        let (speed, is_mended) = braked(LightState::Red, (12.0, 12.0)).unwrap();
+        assert!((speed - 10.39).abs() < 0.01 && is_mended, "{speed}");
+        let (speed, is_mended) = braked(LightState::Red, (13.5, 13.5)).unwrap();
+        assert!((speed - 11.5).abs() < 0.01 && is_mended, "{speed}");
+        assert_eq!(braked(LightState::Green, (12.0, 12.0)), None);
+        assert_eq!(braked(LightState::Red, (12.0, 10.0)), None);
+        // Who cannot stop any more drives on.
+        assert_eq!(braked(LightState::Red, (18.0, 18.0)), None);
+        // At the line nobody creeps over it.
+        let now = Shown::first(BODY, Pose::new(57.8, 0.0, 0.0), dvec2(0.0, 0.0));
+        let lights = Lights {
+            by_lane: vec![(LaneId(2), LightState::Red, None)],
+        };
+        let road = Road::ahead_of(&now, false, &map, &lights);
+        let stays = road.braked(&now, &Pose::new(1.0, 0.0, 0.0));
+        assert_eq!(stays, Some(Pose::IDENTITY));
     }
 
     #[test]

@@ -470,6 +470,55 @@ fn who_misses_the_start_at_green_learns_to_start() {
     assert!(message.contains("held must be at least 0"), "{message}");
 }
 
+/// A random network changes its speed by whatever it draws; tyres do not.
+#[test]
+fn free_drives_can_be_held_to_the_limits_of_rollouts() {
+    let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
+    let text = "lane 1: 0,0 300,0\nego vehicle 0: 10,0 velocity 8,0";
+    let alone = fixture::scenario(text).unwrap();
+    // Of the moves that follow each other, the greatest change of length, metres, and the number of those
+    // to learn from.
+    let drawn = |limits, unchanged, seed| {
+        let config = RelativeDrives {
+            share: 1.0,
+            ruled: 1.0,
+            unchanged,
+            limits,
+            ..RelativeDrives::default()
+        };
+        let driver = drives::NetworkDriver::new(&network, &config).unwrap();
+        let sample = draw(&alone, &SampleConfig::plain(), Some(&driver), Seed(seed)).unwrap();
+        let steps = sample.nodes.chunks_exact(NODE_NUMBERS);
+        let steps: Vec<f32> = steps.map(|n| (5.0 * n[8]).hypot(n[10])).collect();
+        let changes = steps.windows(2).map(|pair| (pair[1] - pair[0]).abs());
+        (changes.fold(0.0, f32::max), sample.targets.len())
+    };
+    let most = |limits| {
+        let changes = (0..6).map(|seed| drawn(limits, 1.0, seed).0);
+        changes.fold(0.0, f32::max)
+    };
+    // 8 m/s² are 2 m.
+    assert!(most(true) < 2.05, "{}", most(true));
+    assert!(most(false) > 2.5, "{}", most(false));
+    // A move that was limited is no longer the network's own.
+    let changed = |limits| (0..6).map(|seed| drawn(limits, 0.0, seed).1).sum::<usize>();
+    assert!(changed(true) > 0 && changed(false) > 0);
+}
+
+#[test]
+fn no_redraw_may_be_worse_unless_it_is_slower() {
+    let at = |x: f64| Pose::new(x, 0.0, 0.0);
+    // Beyond 3 m it runs a light, up to 1 m it stands in the way.
+    let fault = |step: &Pose| match step.position.x {
+        x if x > 3.0 => x - 3.0,
+        x if x < 1.0 => 0.3,
+        _ => 0.0,
+    };
+    let worse = |step: f64, before: f64| drives::is_worse(fault, &at(step), &at(before));
+    assert!(worse(4.0, 2.0) && worse(5.0, 4.0) && worse(3.5, 0.5));
+    assert!(!worse(0.5, 2.0) && !worse(3.5, 4.0) && !worse(2.5, 2.0) && !worse(2.0, 0.5));
+}
+
 #[test]
 fn who_waits_in_a_queue_stays_where_its_log_does() {
     let at = |x: f64| Pose::new(x, 0.0, 0.0);
