@@ -8,7 +8,8 @@
 //!
 //! `map` cuts the map into pieces, `route` says which lanes a vehicle means to follow, `driveway` adds
 //! lanes into driveways, `graph` builds
-//! nodes and edges, `grid` has the bins of a move, `sample` the training samples, `net` the network,
+//! nodes and edges, `grid` has the bins of a move, `sample` the training samples, `returns` the moves that
+//! lead back to a log, `net` the network,
 //! `preference` its loss on moves that are rewarded, `weights` its parameters without a tensor library,
 //! `store` its files. Rollouts are in `gump-engine`, training is in `gump-train`.
 
@@ -21,6 +22,7 @@ pub mod map;
 mod net;
 #[cfg(feature = "tensors")]
 mod preference;
+pub mod returns;
 pub mod route;
 pub mod sample;
 #[cfg(feature = "tensors")]

@@ -14,6 +14,7 @@ use crate::relative::graph::{
 };
 use crate::relative::grid::{FIELDS, STILL_M, quantize};
 use crate::relative::map::{Hidden, PIECE_NUMBERS, VectorMap};
+use crate::relative::returns::{Returns, steered};
 use crate::relative::route::{Route, of_log};
 use crate::steps::stride_of;
 
@@ -30,6 +31,10 @@ pub struct SampleConfig {
     pub perturbed: f64,
     /// Maximum sideways displacement per push, metres.
     pub push_m: f64,
+    /// How they are displaced and return: with `slide` each frame displaces them anew, with `steer` they
+    /// steer aside and back, so that what is shown of them before is a motion of vehicles, too. `slide` by
+    /// default, as in the trainings of all published weights.
+    pub returns: Returns,
     /// Probability of hiding the speed limits of lanes.
     pub hide_limits: f64,
     /// Probability of hiding stop signs.
@@ -56,6 +61,7 @@ impl Default for SampleConfig {
             max_agents: 64,
             perturbed: 0.5,
             push_m: 0.8,
+            returns: Returns::Slide,
             hide_limits: 0.3,
             hide_stop_signs: 0.1,
             hide_lights: 0.05,
@@ -146,9 +152,9 @@ const UNTRACKED: f32 = 0.3;
 /// seconds.
 const SLACK: f64 = 0.6;
 /// The same of a displacement along the path, which nothing presses to make up for.
-const ALONG_SLACK: f64 = 0.8;
+pub(super) const ALONG_SLACK: f64 = 0.8;
 /// Share of its last step that an agent still moves where the log stops.
-const BRAKING: f64 = 0.6;
+pub(super) const BRAKING: f64 = 0.6;
 /// Slower agents are not displaced, metres per second: nothing moves sideways in place.
 const SLOWEST: f64 = 2.0;
 /// A faster agent counts as driving, metres per second.
@@ -175,6 +181,55 @@ impl Track {
     pub fn route(&self, t: usize) -> Option<&Route> {
         self.routes.get(t)?.as_ref()
     }
+
+    /// The next pose of an agent that is off its log in frame `t` and returns to it, shown as `own`; `None`
+    /// if it is not there in both frames.
+    pub fn way_back(&self, t: usize, own: &Shown, returns: Returns) -> Option<Pose> {
+        let state = (*self.states.get(t)?)?;
+        let next = (*self.states.get(t + 1)?)?;
+        let slides = || pushed(next.logged, state.off.then());
+        let steers = || self.steered(t, own, 0.0);
+        let steered = match returns {
+            Returns::Slide => None,
+            // On its log it goes on as that does.
+            Returns::Steer => Some(state.off).filter(Off::is_some).and_then(|_| steers()),
+        };
+        Some(steered.unwrap_or_else(slides))
+    }
+
+    /// The same of a vehicle or a bicycle that aims `aside` metres to the left of its log's way.
+    fn steered(&self, t: usize, own: &Shown, aside: f64) -> Option<Pose> {
+        let logged = self.states.iter().map(|state| Some((*state)?.logged));
+        let log: Vec<Option<Pose>> = logged.collect();
+        steered(own, &log, t, aside)
+    }
+
+    /// Leads an agent aside by steering: at every frame it aims a little farther to the one or the other
+    /// side of its log's way, by `reach` metres at most.
+    fn swerve(&mut self, reach: f64, rng: &mut Rng) {
+        let (mut before, mut aside) = (None::<Shown>, 0.0);
+        for t in 0..self.states.len().saturating_sub(1) {
+            let Some(state) = self.states[t] else {
+                before = None;
+                continue;
+            };
+            let own = match before {
+                Some(before) => before.then(state.shown),
+                None => Shown::first(self.body, state.shown, state.velocity),
+            };
+            before = Some(own);
+            // Who is slow only returns.
+            aside = match state.velocity.length() >= SLOWEST {
+                true => SLACK * aside + within(reach, rng),
+                false => 0.0,
+            };
+            let is_led = aside != 0.0 || state.off.is_some();
+            let to = is_led.then(|| self.steered(t, &own, aside)).flatten();
+            if let Some((next, to)) = self.states[t + 1].as_mut().zip(to) {
+                *next = next.driven_to(to);
+            }
+        }
+    }
 }
 
 /// An agent at a frame.
@@ -192,11 +247,6 @@ pub struct State {
 }
 
 impl State {
-    /// The target half a second later, given the logged pose then.
-    pub fn way_back(&self, next: &Self) -> Pose {
-        pushed(next.logged, self.off.then())
-    }
-
     /// An agent that the log does not have.
     pub fn added(pose: Pose, velocity: DVec2) -> Self {
         Self {
@@ -248,7 +298,7 @@ impl State {
 }
 
 /// Displacement of an agent from its path.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 struct Off {
     ahead_m: f64,
     left_m: f64,
@@ -259,6 +309,9 @@ struct Off {
 pub trait TrackDriver {
     /// Share of samples that it drives.
     fn share(&self) -> f64;
+
+    /// How agents that it has led away from their log return to it.
+    fn returns(&self) -> Returns;
 
     /// Moves the tracks of a sample, which lies around `centre`, to the driven poses, and may add
     /// tracks.
@@ -321,8 +374,11 @@ pub fn draw(
         // Who was led away from the log may have gone another way.
         tell_routes(&scenario.map, &mut tracks, routes);
     }
-    let forget = (config.forget, seed.fork(1));
-    Some(assemble(&map, &tracks, &lights, forget))
+    let manner = Manner {
+        forget: (config.forget, seed.fork(1)),
+        returns: driver.map_or(config.returns, TrackDriver::returns),
+    };
+    Some(assemble(&map, &tracks, &lights, manner))
 }
 
 /// The sample of all frames of a scenario from `start` on, without hiding and displacement, of the
@@ -343,7 +399,7 @@ pub fn whole(
     let track = |id: &AgentId| track(&frames, *id, &plain, 0.0, &mut nothing);
     let tracks: Vec<Track> = ids.iter().map(track).collect();
     let lights = lights(scenario, start, stride, n_frames);
-    Some(assemble(map, &tracks, &lights, (0.0, Seed(0))))
+    Some(assemble(map, &tracks, &lights, Manner::default()))
 }
 
 /// Tells the routes of a share of the vehicles, half of them from the first frame on.
@@ -424,6 +480,7 @@ fn track(
         true => config.push_m * rng.random::<f64>(),
         false => 0.0,
     };
+    let slides = config.returns == Returns::Slide;
     let mut off = Off::default();
     let mut body = None;
     let states = (0..n).map(|t| {
@@ -435,10 +492,9 @@ fn track(
             sized,
         });
         let drives = matches!(agent.kind, AgentKind::Vehicle | AgentKind::Bicycle);
-        if reach > 0.0 && drives && agent.state.speed() >= SLOWEST {
-            let mut within = |bound: f64| bound * (rng.random::<f64>() + rng.random::<f64>() - 1.0);
-            off.left_m = SLACK * off.left_m + within(reach);
-            off.turn = SLACK * off.turn + within(TURN * reach);
+        if slides && reach > 0.0 && drives && agent.state.speed() >= SLOWEST {
+            off.left_m = SLACK * off.left_m + within(reach, rng);
+            off.turn = SLACK * off.turn + within(TURN * reach, rng);
         } else {
             off = Off::default();
         }
@@ -452,7 +508,7 @@ fn track(
         })
     });
     let states: Vec<_> = states.collect();
-    Track {
+    let mut track = Track {
         body: body.unwrap_or(Body {
             kind: AgentKind::Vehicle,
             length: 0.0,
@@ -462,7 +518,16 @@ fn track(
         states,
         routes: Vec::new(),
         is_obstacle: false,
+    };
+    if !slides && reach > 0.0 {
+        track.swerve(reach, rng);
     }
+    track
+}
+
+/// A random number up to a bound on both sides of zero, likelier near it.
+fn within(bound: f64, rng: &mut Rng) -> f64 {
+    bound * (rng.random::<f64>() + rng.random::<f64>() - 1.0)
 }
 
 /// A displaced pose.
@@ -474,6 +539,11 @@ fn pushed(pose: Pose, off: Off) -> Pose {
 }
 
 impl Off {
+    /// Whether there is any.
+    fn is_some(&self) -> bool {
+        *self != Self::default()
+    }
+
     /// The displacement that is left half a second later.
     fn then(self) -> Self {
         Self {
@@ -514,15 +584,27 @@ fn lights(scenario: &Scenario, start: usize, stride: usize, n_frames: usize) -> 
     lights
 }
 
-/// `forget` is the probability that an agent is shown at a frame without its past, and the seed of
-/// these choices.
-fn assemble(
-    map: &VectorMap,
-    tracks: &[Track],
-    lights: &[Lights],
-    (forget, seed): (f64, Seed),
-) -> Sample {
+/// How agents are shown, and what they are to do.
+#[derive(Clone, Copy)]
+struct Manner {
+    /// The probability that one is shown at a frame without its past, and the seed of these choices.
+    forget: (f64, Seed),
+    /// How those that are off their log return to it.
+    returns: Returns,
+}
+
+impl Default for Manner {
+    fn default() -> Self {
+        Self {
+            forget: (0.0, Seed(0)),
+            returns: Returns::default(),
+        }
+    }
+}
+
+fn assemble(map: &VectorMap, tracks: &[Track], lights: &[Lights], manner: Manner) -> Sample {
     let n_frames = lights.len();
+    let (forget, seed) = manner.forget;
     let mut rng = seed.rng();
     // Nodes frame by frame: which agents, how they are shown, and the first node of each frame.
     let mut shown: Vec<Vec<Option<Shown>>> = Vec::with_capacity(n_frames);
@@ -587,10 +669,15 @@ fn assemble(
             }
             graph.offsets.push(graph.sources.len() as u32);
             let learns = !tracks[a].is_obstacle;
-            let target = target(tracks, a, t, own).filter(|target| learns && target.weight > 0.0);
-            if let Some(target) = target {
+            let target = target(&tracks[a], t, own, manner.returns);
+            if let Some(target) = target.filter(|target| learns && target.weight > 0.0) {
                 let node = node_of[t][a].expect("the agent is present");
-                sample.targets.push(Target { node, ..target });
+                let agent = a as u32;
+                sample.targets.push(Target {
+                    node,
+                    agent,
+                    ..target
+                });
             }
         }
     }
@@ -608,23 +695,26 @@ fn assemble(
     sample
 }
 
-/// The target of agent `a` at frame `t`, if it is present in the next.
-fn target(tracks: &[Track], a: usize, t: usize, own: &Shown) -> Option<Target> {
-    let states = &tracks[a].states;
+/// The target of an agent at frame `t`, if it is present in the next; of which node and agent it is, is
+/// left open.
+fn target(track: &Track, t: usize, own: &Shown, returns: Returns) -> Option<Target> {
+    let states = &track.states;
     let state = states[t]?;
     let next = (*states.get(t + 1)?)?;
     let moved = state.logged.inverse() * next.logged;
+    let steers =
+        returns == Returns::Steer && own.body.kind != AgentKind::Pedestrian && state.off.is_some();
     let stops = moved.position.length() < STILL_M;
-    let step = if stops {
+    let step = if stops && !steers {
         // An agent behind the log drives on to where the log stops, if that is on its way.
         let left = (-state.off.ahead_m).clamp(0.0, BRAKING * own.step.position.x.max(0.0));
         Pose::new(left, 0.0, 0.0)
     } else {
-        own.pose.inverse() * state.way_back(&next)
+        own.pose.inverse() * track.way_back(t, own, returns)?
     };
     Some(Target {
         node: 0,
-        agent: a as u32,
+        agent: 0,
         frame: t as u32,
         bins: quantize(step),
         weight: next.weight * if own.tracked { 1.0 } else { UNTRACKED },

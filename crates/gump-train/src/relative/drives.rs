@@ -27,6 +27,7 @@ use gump_model::local_context::LaneMap;
 use gump_model::relative::graph::{Lights, Shown, look};
 use gump_model::relative::grid::dequantize;
 use gump_model::relative::map::VectorMap;
+use gump_model::relative::returns::Returns;
 use gump_model::relative::route::{Route, Traveller};
 use gump_model::relative::sample::{Track, TrackDriver};
 use gump_model::relative::{RelativeNetwork, RelativeWeights};
@@ -96,6 +97,12 @@ pub struct RelativeDrives {
     /// the agent moves along that path instead: a vehicle that stays at a light that has turned
     /// green gives no information on how to catch up.
     pub tolerance_m: f64,
+    /// How driven agents return to their log. With `slide` a share of their offset is gone after half a
+    /// second, in position and heading apart, at any speed: a motion that no vehicle makes. With `steer`
+    /// vehicles and bicycles aim at a place on their log's way 1.2 s ahead and take the arc of a bicycle
+    /// towards it, gain or lose 4 m/s² at most unless the log does, and reverse only with the log. `slide`
+    /// by default, as in the trainings of all published weights.
+    pub returns: Returns,
     /// Divides the logits of the draws.
     pub temperature: f64,
     /// Steps after which the driving network is updated; with rewards, the smaller of both.
@@ -137,6 +144,7 @@ impl Default for RelativeDrives {
             share: 0.5,
             candidates: 4,
             tolerance_m: 0.6,
+            returns: Returns::Slide,
             temperature: 1.0,
             refresh: 50,
             ruled: 0.0,
@@ -244,6 +252,10 @@ impl NetworkDriver {
 impl TrackDriver for NetworkDriver {
     fn share(&self) -> f64 {
         self.config.share
+    }
+
+    fn returns(&self) -> Returns {
+        self.config.returns
     }
 
     /// Moves the agents of a sample, which lies around `centre`, to the poses that the network
@@ -411,14 +423,14 @@ impl TrackDriver for NetworkDriver {
             }
             let moves = self.draws(&hidden, here.len(), seed, &mut room);
             for (i, &a) in here.iter().enumerate() {
-                let (Some(now), Some(next)) = (tracks[a].states[t], tracks[a].states[t + 1]) else {
+                let wanted = tracks[a].way_back(t, &agents[i], self.config.returns);
+                let (Some(wanted), Some(next)) = (wanted, tracks[a].states[t + 1]) else {
                     continue;
                 };
                 let candidates = moves.iter().map(|of_draw| agents[i].pose * of_draw[i]);
                 let nearest =
                     candidates.min_by(|a, b| far(*a, next.logged).total_cmp(&far(*b, next.logged)));
                 let nearest = nearest.expect("there is at least one candidate");
-                let wanted = now.way_back(&next);
                 let shown = match far(nearest, wanted) < self.config.tolerance_m {
                     true => nearest,
                     false => wanted,

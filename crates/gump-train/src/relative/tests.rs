@@ -7,6 +7,7 @@ use gump_engine::relative::{RelativeSampling, RelativeWorld};
 use gump_geometry::Pose;
 use gump_model::checkpoint;
 use gump_model::relative::graph::{Body, NODE_NUMBERS};
+use gump_model::relative::returns::Returns;
 use gump_model::relative::sample::{SampleConfig, State, Track, draw};
 use gump_model::relative::{RelativeConfig, RelativeNetwork, grid, is_relative, load, sample};
 use gump_nn::OptimizerConfig;
@@ -280,6 +281,64 @@ fn driven_agents_leave_the_log_and_learn_the_way_back() {
     let (one, many) = (far(Some(&drives(1))), far(Some(&drives(64))));
     assert!(one.0 > 0 && one.1, "{one:?}");
     assert!(many.0 > 0, "{many:?}");
+}
+
+/// The way back of vehicles that steer is one that vehicles drive, whether a network drove them away from
+/// their log or they were pushed; and where they were pushed, so is what is shown of them.
+#[test]
+fn who_steers_back_does_not_slide() {
+    let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
+    let text = "lane 1: 0,0 300,0\nego vehicle 0: 10,0 velocity 12,0";
+    let alone = fixture::scenario(text).unwrap();
+    // What the rear axle moves across the mean of its headings, metres.
+    let slides = |x: f64, y: f64, turn: f64| (y - (0.5 * x + 1.4) * turn).abs();
+    // The most in the targets, and in the steps that are shown.
+    let most = |returns: Returns, is_driven: bool| {
+        let drives = RelativeDrives {
+            share: 1.0,
+            candidates: 16,
+            tolerance_m: 3.0,
+            returns,
+            ..RelativeDrives::default()
+        };
+        let sample = SampleConfig {
+            perturbed: 1.0,
+            returns,
+            ..SampleConfig::plain()
+        };
+        let driver = drives::NetworkDriver::new(&network, &drives).unwrap();
+        let driver = is_driven.then_some(&driver as _);
+        let of_seed = |seed| {
+            let sample = draw(&alone, &sample, driver, Seed(seed)).unwrap();
+            let targets = sample.targets.iter().map(|target| {
+                let step = grid::dequantize(target.bins);
+                slides(step.position.x, step.position.y, step.heading)
+            });
+            let shown = sample.nodes.chunks_exact(NODE_NUMBERS).skip(1);
+            let shown = shown.map(|n| {
+                let [x, y, turn] = [5.0 * n[8], n[10], 0.5 * n[12]].map(f64::from);
+                slides(x, y, turn)
+            });
+            let worst = [targets.fold(0.0, f64::max), shown.fold(0.0, f64::max)];
+            (worst, sample.nodes)
+        };
+        let all: Vec<_> = (0..12).map(of_seed).collect();
+        let worst = [0, 1].map(|k| all.iter().map(|(worst, _)| worst[k]).fold(0.0, f64::max));
+        (worst, all)
+    };
+    for is_driven in [false, true] {
+        let (slid, _) = most(Returns::Slide, is_driven);
+        assert!(slid[0] > 0.3, "{is_driven}: {slid:?}");
+        let (steered, all) = most(Returns::Steer, is_driven);
+        assert!(steered[0] < 0.08, "{is_driven}: {steered:?}");
+        // They were led away: there are sideways moves.
+        let aside = all
+            .iter()
+            .flat_map(|(_, nodes)| nodes.chunks_exact(NODE_NUMBERS));
+        assert!(aside.map(|n| n[10].abs()).fold(0.0, f32::max) > 0.05);
+    }
+    assert!(most(Returns::Steer, false).0[1] < 0.02);
+    assert!(most(Returns::Slide, false).0[1] > 0.3);
 }
 
 /// Under the rules agents deviate from the log, and their own moves are the targets.
