@@ -31,6 +31,7 @@ use gump_model::relative::returns::Returns;
 use gump_model::relative::route::{Route, Traveller};
 use gump_model::relative::sample::{Track, TrackDriver};
 use gump_model::relative::{RelativeNetwork, RelativeWeights};
+use gump_model::steps::TOKEN_DT;
 use gump_scene::{AgentKind, MapGraph, Seed};
 use rand::Rng as _;
 use serde::{Deserialize, Serialize};
@@ -119,6 +120,11 @@ pub struct RelativeDrives {
     /// network's own: it learns from them to do what it does, without the tail that was cut off, so
     /// that people turn and vehicles change lane less with every update.
     pub unchanged: f32,
+    /// Whether in those samples a vehicle's own start counts in full, and standing in a queue, which the log
+    /// gives, as `unchanged`. Without it, with `unchanged` below 1, to stand there counts more than to start,
+    /// and the network learns to start more rarely. Vehicles that are parked count in full either way.
+    /// False by default, as in the trainings of all published weights.
+    pub starts: bool,
     /// How often in those samples a vehicle that stands at a green light, and could start, is held there
     /// for a step, with its start as the target. In logs nobody who has the way free stands at a light
     /// that has been green for a second: a network that misses its start has never seen that, and stands
@@ -151,6 +157,7 @@ impl Default for RelativeDrives {
             redraws: 8,
             top_p: 0.95,
             unchanged: 1.0,
+            starts: false,
             held: 0.0,
             limits: false,
             crowd: Crowd::default(),
@@ -220,7 +227,7 @@ struct Judge<'a> {
 
 /// Where a move under the rules comes from.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Origin {
+pub(super) enum Origin {
     /// The log has it.
     Log,
     /// It is the network's first draw.
@@ -359,8 +366,10 @@ impl TrackDriver for NetworkDriver {
                 };
                 let mut given = Vec::new();
                 let (mut roads, mut paces) = (Vec::new(), Vec::new());
+                let mut queued = Vec::with_capacity(here.len());
                 for (i, (&a, now)) in here.iter().zip(&agents).enumerate() {
-                    let stays = stays[a] || is_queued(a, now);
+                    queued.push(!stays[a] && is_queued(a, now));
+                    let stays = stays[a] || queued[i];
                     let mut road = Road::ahead_of(now, stays, streets, lights);
                     if self.config.held == 0.0 {
                         road = road.blind_to_green();
@@ -411,11 +420,7 @@ impl TrackDriver for NetworkDriver {
                             *next = next.held_at(now.pose, now.pose * step);
                             continue;
                         }
-                        let weight = match origin {
-                            Origin::Log | Origin::Changed => 1.0,
-                            Origin::FirstDraw => self.config.unchanged,
-                            Origin::Faulty => 0.0,
-                        };
+                        let weight = self.weight(origin, queued[i], sets_off(now, &step));
                         *next = next.led_to(now.pose * step, weight);
                     }
                 }
@@ -442,6 +447,19 @@ impl TrackDriver for NetworkDriver {
 }
 
 impl NetworkDriver {
+    /// The weight in the loss of a move under the rules, of an agent that is queued in its log or not, and
+    /// sets off with it or does not.
+    pub(super) fn weight(&self, origin: Origin, is_queued: bool, sets_off: bool) -> f32 {
+        let (unchanged, starts) = (self.config.unchanged, self.config.starts);
+        match origin {
+            Origin::Log if starts && is_queued => unchanged,
+            Origin::FirstDraw if starts && sets_off => 1.0,
+            Origin::FirstDraw => unchanged,
+            Origin::Log | Origin::Changed => 1.0,
+            Origin::Faulty => 0.0,
+        }
+    }
+
     /// A move of every agent in its own frame, redrawn where it has a fault and where the rules
     /// forbid it; some are given. With each, where it comes from.
     fn moves_by_the_rules(
@@ -554,6 +572,13 @@ impl NetworkDriver {
         });
         candidates.collect()
     }
+}
+
+/// Whether a vehicle stands, and starts with this move.
+pub(super) fn sets_off(now: &Shown, step: &Pose) -> bool {
+    now.body.kind == AgentKind::Vehicle
+        && now.velocity().length() * TOKEN_DT <= CREEPS_M
+        && step.position.length() > CREEPS_M
 }
 
 /// Whether a move is no slower than the one before, and has a greater fault.

@@ -4,9 +4,9 @@ use std::sync::Arc;
 
 use candle_core::Device;
 use gump_engine::relative::{RelativeSampling, RelativeWorld};
-use gump_geometry::Pose;
+use gump_geometry::{Pose, dvec2};
 use gump_model::checkpoint;
-use gump_model::relative::graph::{Body, NODE_NUMBERS};
+use gump_model::relative::graph::{Body, NODE_NUMBERS, Shown};
 use gump_model::relative::returns::Returns;
 use gump_model::relative::sample::{SampleConfig, State, Track, draw};
 use gump_model::relative::{RelativeConfig, RelativeNetwork, grid, is_relative, load, sample};
@@ -562,6 +562,45 @@ fn free_drives_can_be_held_to_the_limits_of_rollouts() {
     // A move that was limited is no longer the network's own.
     let changed = |limits| (0..6).map(|seed| drawn(limits, 0.0, seed).1).sum::<usize>();
     assert!(changed(true) > 0 && changed(false) > 0);
+}
+
+/// To stand in a queue does not count more than to leave it, if so asked.
+#[test]
+fn own_starts_can_count_as_much_as_standing_in_the_log() {
+    use drives::Origin::{Changed, Faulty, FirstDraw, Log};
+    let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
+    let weights = |starts| {
+        let config = RelativeDrives {
+            unchanged: 0.25,
+            starts,
+            ..RelativeDrives::default()
+        };
+        let driver = drives::NetworkDriver::new(&network, &config).unwrap();
+        // A start and another move of its own; standing queued and parked; changed; no move of drivers.
+        [
+            driver.weight(FirstDraw, false, true),
+            driver.weight(FirstDraw, false, false),
+            driver.weight(Log, true, false),
+            driver.weight(Log, false, false),
+            driver.weight(Changed, false, false),
+            driver.weight(Faulty, false, true),
+        ]
+    };
+    assert_eq!(weights(false), [0.25, 0.25, 1.0, 1.0, 1.0, 0.0]);
+    assert_eq!(weights(true), [1.0, 0.25, 0.25, 1.0, 1.0, 0.0]);
+    let body = |kind| Body {
+        kind,
+        length: 4.5,
+        width: 1.9,
+        sized: true,
+    };
+    let starts = |kind, speed: f64, step: f64| {
+        let now = Shown::first(body(kind), Pose::IDENTITY, dvec2(speed, 0.0));
+        drives::sets_off(&now, &Pose::new(step, 0.0, 0.0))
+    };
+    use gump_scene::AgentKind::{Pedestrian, Vehicle};
+    assert!(starts(Vehicle, 0.0, 0.3) && !starts(Vehicle, 0.0, 0.0));
+    assert!(!starts(Vehicle, 2.0, 1.0) && !starts(Pedestrian, 0.0, 0.3));
 }
 
 #[test]
