@@ -16,6 +16,8 @@ pub struct ObservedAgent {
     memory: AgentMemory,
     /// Where it means to go, if the network is told.
     route: Option<Route>,
+    /// Whether a vehicle without a reason to slow down is shown without its past, though it is not late.
+    hides_free_past: bool,
 }
 
 impl ObservedAgent {
@@ -25,6 +27,7 @@ impl ObservedAgent {
             shown: vec![Shown::first(body, pose, velocity)],
             memory: engine.blank(),
             route: None,
+            hides_free_past: false,
         }
     }
 
@@ -67,6 +70,12 @@ impl ObservedAgent {
         self.route = route;
     }
 
+    /// Sets whether a vehicle is shown without its past where it has no reason to slow down, though it is
+    /// not late: training shows in part of its frames what long rollouts show.
+    pub fn hide_free_past(&mut self, hides: bool) {
+        self.hides_free_past = hides;
+    }
+
     /// Advances by half a second to this pose.
     pub fn push(&mut self, pose: Pose) {
         self.shown.push(self.now().then(pose));
@@ -103,7 +112,8 @@ pub fn add_presents<'a>(
         let now = &agents[i];
         let mut view = look(map, lights, &agents, i, seen.route.as_ref());
         let is_vehicle = now.body.kind == AgentKind::Vehicle;
-        let past = match frame.is_late && is_vehicle && view.is_free(now) {
+        let hides = frame.is_late || seen.hides_free_past;
+        let past = match hides && is_vehicle && view.is_free(now) {
             true => 0,
             false => PAST,
         };

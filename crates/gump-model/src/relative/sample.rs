@@ -48,6 +48,10 @@ pub struct SampleConfig {
     /// Probability that an agent is shown at a frame without its past: a network that always sees it
     /// learns to repeat it.
     pub forget: f64,
+    /// Probability that a vehicle that moves and sees nothing to slow down for (`View::is_free`) is shown at
+    /// a frame without its past, in drives as in logs: rollouts show it so after nine seconds. From 0 to 1;
+    /// 0 by default, as in the trainings of all published weights.
+    pub forget_free: f64,
     /// Probability that a vehicle is shown with its route, from the first frame on or a later one.
     pub routes: f64,
 }
@@ -68,6 +72,7 @@ impl Default for SampleConfig {
             hide_size: 0.02,
             cut_tracks: 0.1,
             forget: 0.0,
+            forget_free: 0.0,
             routes: 0.0,
         }
     }
@@ -84,6 +89,7 @@ impl SampleConfig {
             hide_size: 0.0,
             cut_tracks: 0.0,
             forget: 0.0,
+            forget_free: 0.0,
             routes: 0.0,
             ..Self::default()
         }
@@ -305,6 +311,23 @@ struct Off {
     turn: f64,
 }
 
+/// At which frames which vehicles are shown without their past if they see nothing to slow down for: the
+/// same in a drive and in the sample that shows it.
+#[derive(Clone, Copy, Debug)]
+pub struct FreePasts {
+    /// Probability of a vehicle at a frame.
+    share: f64,
+    seed: Seed,
+}
+
+impl FreePasts {
+    /// Whether it is so of an agent at a frame, by index.
+    pub fn is_hidden(self, agent: usize, frame: usize) -> bool {
+        let stream = || self.seed.fork(agent as u64).fork(frame as u64);
+        self.share > 0.0 && stream().rng().random_bool(self.share)
+    }
+}
+
 /// Drives the agents of a sample away from their log.
 pub trait TrackDriver {
     /// Share of samples that it drives.
@@ -321,7 +344,7 @@ pub trait TrackDriver {
         map: &VectorMap,
         lights: &[Lights],
         tracks: &mut Vec<Track>,
-        seed: Seed,
+        chance: (FreePasts, Seed),
     );
 }
 
@@ -368,14 +391,20 @@ pub fn draw(
     };
     let routes = (config.routes, seed.fork(2));
     tell_routes(&scenario.map, &mut tracks, routes);
+    let free_pasts = FreePasts {
+        share: config.forget_free,
+        seed: seed.fork(3),
+    };
     if let Some(driver) = driver {
         let place = (&*scenario.map, centre);
-        driver.drive(place, &map, &lights, &mut tracks, seed.fork(0));
+        let chance = (free_pasts, seed.fork(0));
+        driver.drive(place, &map, &lights, &mut tracks, chance);
         // Who was led away from the log may have gone another way.
         tell_routes(&scenario.map, &mut tracks, routes);
     }
     let manner = Manner {
         forget: (config.forget, seed.fork(1)),
+        free_pasts,
         returns: driver.map_or(config.returns, TrackDriver::returns),
     };
     Some(assemble(&map, &tracks, &lights, manner))
@@ -589,6 +618,8 @@ fn lights(scenario: &Scenario, start: usize, stride: usize, n_frames: usize) -> 
 struct Manner {
     /// The probability that one is shown at a frame without its past, and the seed of these choices.
     forget: (f64, Seed),
+    /// The same of vehicles that see nothing to slow down for.
+    free_pasts: FreePasts,
     /// How those that are off their log return to it.
     returns: Returns,
 }
@@ -597,6 +628,10 @@ impl Default for Manner {
     fn default() -> Self {
         Self {
             forget: (0.0, Seed(0)),
+            free_pasts: FreePasts {
+                share: 0.0,
+                seed: Seed(0),
+            },
             returns: Returns::default(),
         }
     }
@@ -647,7 +682,11 @@ fn assemble(map: &VectorMap, tracks: &[Track], lights: &[Lights], manner: Manner
                 graph.sources.push(source);
                 sample.edge_numbers.extend(row);
             };
-            let past = match forget > 0.0 && rng.random_bool(forget) {
+            let view = look(map, &lights[t], &agents, i, tracks[a].route(t));
+            let is_forgotten = forget > 0.0 && rng.random_bool(forget);
+            let is_vehicle = own.body.kind == AgentKind::Vehicle;
+            let hides = is_vehicle && manner.free_pasts.is_hidden(a, t);
+            let past = match is_forgotten || hides && view.is_free(own) {
                 true => 0,
                 false => PAST.min(t),
             };
@@ -657,7 +696,6 @@ fn assemble(map: &VectorMap, tracks: &[Track], lights: &[Lights], manner: Manner
                 };
                 push(node, &past_edge(own, then, ago));
             }
-            let view = look(map, &lights[t], &agents, i, tracks[a].route(t));
             for (j, row) in &view.neighbours {
                 let node = node_of[t][present[*j]].expect("a neighbour is present");
                 push(node, row);

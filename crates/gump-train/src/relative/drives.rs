@@ -29,7 +29,7 @@ use gump_model::relative::grid::dequantize;
 use gump_model::relative::map::VectorMap;
 use gump_model::relative::returns::Returns;
 use gump_model::relative::route::{Route, Traveller};
-use gump_model::relative::sample::{Track, TrackDriver};
+use gump_model::relative::sample::{FreePasts, Track, TrackDriver};
 use gump_model::relative::{RelativeNetwork, RelativeWeights};
 use gump_model::steps::TOKEN_DT;
 use gump_scene::{AgentKind, MapGraph, Seed};
@@ -273,7 +273,7 @@ impl TrackDriver for NetworkDriver {
         map: &VectorMap,
         lights: &[Lights],
         tracks: &mut Vec<Track>,
-        seed: Seed,
+        (free_pasts, seed): (FreePasts, Seed),
     ) {
         let ruled = seed.fork(RULED).rng().random_bool(self.config.ruled);
         let n_logged = tracks.len();
@@ -307,7 +307,7 @@ impl TrackDriver for NetworkDriver {
         let mut members: Vec<Option<ObservedAgent>> = tracks.iter().map(|_| None).collect();
         let (mut room, mut hidden) = (Workspace::default(), Vec::new());
         for (t, lights) in lights.iter().enumerate().take(lights.len().max(1) - 1) {
-            for (track, member) in tracks.iter().zip(&mut members) {
+            for (a, (track, member)) in tracks.iter().zip(&mut members).enumerate() {
                 match (track.states[t], &mut *member) {
                     (None, _) => *member = None,
                     (Some(state), Some(seen)) => seen.push(state.shown),
@@ -324,6 +324,7 @@ impl TrackDriver for NetworkDriver {
                 if let Some(seen) = member {
                     let route = told_route(streets, track.route(t), seen, seed.fork(ROUTE));
                     seen.head_for(route);
+                    seen.hide_free_past(free_pasts.is_hidden(a, t));
                 }
             }
             let agents: Vec<Shown> = members.iter().flatten().map(ObservedAgent::now).collect();

@@ -141,6 +141,11 @@ fn probabilities_of_samples_are_checked() {
         ..SampleConfig::default()
     });
     assert!(forget.unwrap_err().contains("sample.forget"));
+    let forget_free = wrong(SampleConfig {
+        forget_free: -0.5,
+        ..SampleConfig::default()
+    });
+    assert!(forget_free.unwrap_err().contains("sample.forget_free"));
 }
 
 #[test]
@@ -750,6 +755,40 @@ fn the_past_is_forgotten_as_often_as_asked() {
         whole > 0 && (half - whole / 2).abs() < whole / 5,
         "{half} of {whole}"
     );
+}
+
+/// Vehicles on a free road lose their past, in drives as in logs; who stands or walks keeps it.
+#[test]
+fn free_vehicles_are_shown_without_their_past_as_often_as_asked() {
+    let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
+    let closed_loop = RelativeDrives {
+        share: 1.0,
+        ruled: 1.0,
+        ..RelativeDrives::default()
+    };
+    let driver = drives::NetworkDriver::new(&network, &closed_loop).unwrap();
+    let drawn = |text: &str, forget_free, is_driven: bool| {
+        let config = SampleConfig {
+            forget_free,
+            ..SampleConfig::plain()
+        };
+        let driver = is_driven.then_some(&driver as _);
+        let scenario = fixture::scenario(text).unwrap();
+        let sample = draw(&scenario, &config, driver, Seed(1)).unwrap();
+        (sample.nodes.clone(), sample.n_edges() as i64)
+    };
+    let road = "lane 1: 0,0 400,0\nego vehicle 0: 10,0 velocity 8,0";
+    let [all, some, none] = [0.0, 0.5, 1.0].map(|share| drawn(road, share, false));
+    assert!(all.0 == some.0 && all.0 == none.0);
+    assert!(all.1 > some.1 && some.1 > none.1);
+    // The only vehicle is free at every frame: an edge to itself is left of each past.
+    let n = (all.0.len() / NODE_NUMBERS) as i64;
+    let pasts: i64 = (0..n).map(|t| t.min(6)).sum();
+    assert_eq!(all.1 - none.1, pasts);
+    // The drive is shown what the sample shows: another past, other draws.
+    assert_ne!(drawn(road, 0.0, true).0, drawn(road, 1.0, true).0);
+    let others = "lane 1: 0,0 400,0\nego vehicle 0: 10,0\nagent pedestrian 1: 20,9 velocity 1,0";
+    assert_eq!(drawn(others, 0.0, false).1, drawn(others, 1.0, false).1);
 }
 
 #[test]

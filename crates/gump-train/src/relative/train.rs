@@ -119,6 +119,7 @@ impl RelativeTrainConfig {
             ("sample.hide_size", sample.hide_size),
             ("sample.cut_tracks", sample.cut_tracks),
             ("sample.forget", sample.forget),
+            ("sample.forget_free", sample.forget_free),
             ("sample.routes", sample.routes),
         ];
         let wrong = probabilities
