@@ -38,7 +38,7 @@ const REACH_M: f64 = 70.0;
 /// Space around an added agent, metres, ...
 const SPACE_M: f64 = 0.6;
 /// ... and ahead of one that moves, seconds at its speed.
-const HEADWAY_S: f64 = 1.0;
+pub(super) const HEADWAY_S: f64 = 1.0;
 /// Places tried for an agent.
 const ATTEMPTS: usize = 6;
 
@@ -163,7 +163,8 @@ impl Newcomer {
     }
 }
 
-fn shape(body: Body, pose: Pose) -> OrientedBox {
+/// The box of an agent at a pose.
+pub(super) fn shape(body: Body, pose: Pose) -> OrientedBox {
     OrientedBox {
         pose,
         length: body.length,

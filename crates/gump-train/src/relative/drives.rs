@@ -21,7 +21,7 @@ use gump_engine::relative::keep_clear::closed_entry;
 use gump_engine::relative::right_of_way::{Course, courses, yielding_speed};
 use gump_engine::relative::rules::{kinematically_limited, resolve};
 use gump_engine::relative::seen::{FrameIndex, ObservedAgent, add_presents};
-use gump_geometry::{DVec2, Pose, angle_difference};
+use gump_geometry::{DVec2, OrientedBox, Pose, angle_difference};
 use gump_kernels::panels::Precision;
 use gump_model::local_context::LaneMap;
 use gump_model::relative::graph::{Lights, Shown, look};
@@ -29,7 +29,7 @@ use gump_model::relative::grid::dequantize;
 use gump_model::relative::map::VectorMap;
 use gump_model::relative::returns::Returns;
 use gump_model::relative::route::{Route, Traveller};
-use gump_model::relative::sample::{FreePasts, Track, TrackDriver};
+use gump_model::relative::sample::{FreePasts, State, Track, TrackDriver};
 use gump_model::relative::{RelativeNetwork, RelativeWeights};
 use gump_model::steps::TOKEN_DT;
 use gump_scene::{AgentKind, MapGraph, Seed};
@@ -37,7 +37,7 @@ use rand::Rng as _;
 use serde::{Deserialize, Serialize};
 
 use crate::TrainError;
-use crate::relative::crowd::Crowd;
+use crate::relative::crowd::{Crowd, HEADWAY_S, shape};
 use crate::relative::faults::{CREEPS_M, Road, sign_lines};
 use crate::relative::pace::Pace;
 
@@ -135,7 +135,8 @@ pub struct RelativeDrives {
     /// are limited (`gump_engine::relative::rules::kinematically_limited`), and count as changed; (b) no
     /// redraw that clears others has a greater fault than the move before, unless it is slower; (c) a
     /// vehicle all draws of which are faulty brakes where it is too fast for a bend, a light, a sign or
-    /// others' right of way, and a move that still has a fault has no weight. False by default, as in the
+    /// others' right of way, and a move that still has a fault has no weight. And in all drives an agent
+    /// that the log has appear where another was driven to does not appear. False by default, as in the
     /// trainings of all published weights.
     pub limits: bool,
     /// Agents that are added to those samples.
@@ -307,6 +308,14 @@ impl TrackDriver for NetworkDriver {
         let mut members: Vec<Option<ObservedAgent>> = tracks.iter().map(|_| None).collect();
         let (mut room, mut hidden) = (Workspace::default(), Vec::new());
         for (t, lights) in lights.iter().enumerate().take(lights.len().max(1) - 1) {
+            if self.config.limits && t >= WARM_UP {
+                // Under the rules tracks have their driven poses for logged ones.
+                let log = |a: usize, state: &State| match ruled {
+                    true => logs[a][t],
+                    false => Some(state.logged),
+                };
+                drop_blocked(tracks, t, log);
+            }
             for (a, (track, member)) in tracks.iter().zip(&mut members).enumerate() {
                 match (track.states[t], &mut *member) {
                     (None, _) => *member = None,
@@ -572,6 +581,45 @@ impl NetworkDriver {
             bins.into_iter().map(dequantize).collect()
         });
         candidates.collect()
+    }
+}
+
+/// Takes out of a sample, from frame `t` on, who appears there where another was driven to: whose box
+/// touches it, or would within a second, though it would not touch that agent where `log` has it then.
+pub(super) fn drop_blocked(
+    tracks: &mut [Track],
+    t: usize,
+    log: impl Fn(usize, &State) -> Option<Pose>,
+) {
+    let appears = |track: &Track| t > 0 && track.states[t - 1].is_none();
+    let driven = tracks.iter().enumerate().filter_map(|(a, track)| {
+        let state = track.states[t].filter(|_| !appears(track))?;
+        let logged = log(a, &state);
+        let is_led = logged.is_none_or(|logged| far(logged, state.shown) > SAME);
+        is_led.then(|| {
+            let logged = logged.map(|pose| shape(track.body, pose));
+            (shape(track.body, state.shown), logged)
+        })
+    });
+    let driven: Vec<(OrientedBox, Option<OrientedBox>)> = driven.collect();
+    for track in tracks.iter_mut() {
+        let Some(state) = track.states[t].filter(|_| appears(track)) else {
+            continue;
+        };
+        let own = shape(track.body, state.shown);
+        let ahead = HEADWAY_S * state.velocity.length();
+        let soon = OrientedBox {
+            pose: own.pose * Pose::new(0.5 * ahead, 0.0, 0.0),
+            length: own.length + ahead,
+            ..own
+        };
+        let is_blocked = driven.iter().any(|(here, logged)| {
+            let follows_in_log = || logged.is_some_and(|logged| soon.overlaps(&logged));
+            own.overlaps(here) || soon.overlaps(here) && !follows_in_log()
+        });
+        if is_blocked {
+            track.states[t..].fill(None);
+        }
     }
 }
 

@@ -728,6 +728,47 @@ fn tracks(scenario: &Scenario) -> Vec<Track> {
     agents.iter().map(of).collect()
 }
 
+#[test]
+fn nobody_appears_where_another_was_driven_to() {
+    let body = Body {
+        kind: gump_scene::AgentKind::Vehicle,
+        length: 4.0,
+        width: 2.0,
+        sized: true,
+    };
+    let at = |x: f64, speed: f64| State::added(Pose::new(x, 0.0, 0.0), dvec2(speed, 0.0));
+    let track = |states: [Option<State>; 4]| Track {
+        body,
+        states: states.to_vec(),
+        routes: Vec::new(),
+        is_obstacle: false,
+    };
+    // Whether one that appears in frame 2 at 0 m and so many m/s is left there, with another that was
+    // driven to one place and is logged at another.
+    let is_left = |speed: f64, driven: f64, logged: Option<f64>| {
+        let mut tracks = [
+            track([Some(at(driven, 0.0)); 4]),
+            track([
+                None,
+                None,
+                Some(at(0.0, speed)),
+                Some(at(speed / 2.0, speed)),
+            ]),
+        ];
+        let log = |_: usize, _: &State| logged.map(|x| Pose::new(x, 0.0, 0.0));
+        drives::drop_blocked(&mut tracks, 2, log);
+        assert!(tracks[0].states.iter().all(Option::is_some));
+        let left = tracks[1].states.iter().flatten().count();
+        assert!(left == 0 || left == 2);
+        left == 2
+    };
+    assert!(!is_left(0.0, 3.0, Some(30.0)) && is_left(0.0, 5.0, Some(30.0)));
+    // Eight metres ahead, at 8 m/s: unless its log is as near, or the other was not driven.
+    assert!(!is_left(8.0, 8.0, Some(30.0)) && !is_left(8.0, 8.0, None));
+    assert!(is_left(2.0, 8.0, None) && is_left(8.0, 8.0, Some(9.0)));
+    assert!(!is_left(8.0, 3.0, Some(9.0)) && is_left(8.0, 3.0, Some(3.0)));
+}
+
 /// An agent shown without its past has fewer edges and the same targets.
 #[test]
 fn the_past_is_forgotten_as_often_as_asked() {
