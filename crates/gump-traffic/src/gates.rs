@@ -174,12 +174,15 @@ impl Flow {
             speed: USUAL_SPEED,
             sizes: Default::default(),
             waiting: BTreeMap::new(),
-            next_id: 1 + now
-                .agents()
+            // An agent that has left before the present keeps its id as well.
+            next_id: scene
+                .history
                 .iter()
+                .flat_map(Frame::agents)
                 .map(|agent| agent.id.0)
                 .max()
-                .unwrap_or(0),
+                .unwrap_or(0)
+                .saturating_add(1),
         };
         this.lanes_m = lane_metres(scene.map, &this.centres, config.window_m);
         this.lanes_at_start_m = this.lanes_m[0];
@@ -342,7 +345,7 @@ impl Flow {
         let speed = entering_speed(gate, there, size[0], wanted)?;
         *self.waiting.entry(key).or_default() -= 1;
         let id = AgentId(self.next_id);
-        self.next_id += 1;
+        self.next_id = self.next_id.saturating_add(1);
         let position = gate.pose.position;
         Some(Agent {
             id,
@@ -675,6 +678,26 @@ mod tests {
         assert_eq!(at(395.0).0, [395.0]);
         assert_eq!(at(500.0), (vec![0.0], vec![330.0]));
         assert_eq!(at(300.0).0, [300.0]);
+    }
+
+    #[test]
+    fn new_agents_get_ids_that_nobody_had() {
+        let text = "lane 1: -200,0 200,0\nego vehicle 0: 0,0\nagent vehicle 7: 30,0\n\
+                    history 1 future 0 dt 0.5";
+        let mut scenario = fixture::scenario(text).unwrap();
+        let ego = *scenario.present().ego_now();
+        scenario.log[scenario.now] = Frame::new(vec![ego], Vec::new());
+        let next_id = |scenario: &Scenario| {
+            let flow = Flow::begin(&Arrivals::default(), scenario.present(), Seed(0));
+            flow.unwrap().next_id
+        };
+        assert_eq!(next_id(&scenario), 8);
+        let last = Agent {
+            id: AgentId(i64::MAX),
+            ..ego
+        };
+        scenario.log[0] = Frame::new(vec![ego, last], Vec::new());
+        assert_eq!(next_id(&scenario), i64::MAX);
     }
 
     #[test]
