@@ -164,6 +164,7 @@ impl TransformerWorld {
             .history
             .last()
             .map_or(0, |_| shared.history.len() - 1);
+        let phases = Phases::of(&shared.recent);
         let future = |(k, rings): (usize, Vec<(u16, Chunk)>)| {
             let mut future = RolloutState {
                 scene,
@@ -174,7 +175,7 @@ impl TransformerWorld {
                 rings: BTreeMap::new(),
                 recent: shared.recent.clone(),
                 identities: shared.identities.clone(),
-                phases: Phases::default(),
+                phases: phases.clone(),
                 kv_cache: shared.prefix.clone(),
             };
             for (id, chunk) in rings {

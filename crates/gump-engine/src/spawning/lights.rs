@@ -43,6 +43,24 @@ const ONE_LINE_M: f64 = 1.0;
 pub(crate) struct Phases(BTreeMap<LaneId, usize>);
 
 impl Phases {
+    /// From the frames so far, the last of which is the present.
+    pub(crate) fn of(frames: &[Frame]) -> Self {
+        let Some((now, before)) = frames.split_last() else {
+            return Self::default();
+        };
+        let age = |lane: LaneId, state: LightState| {
+            let states = before.iter().rev().map(|frame| frame.light(lane));
+            let mut states = states.map(|light| light.map(|light| light.state));
+            // Nobody knows what was shown before a frame in which the light was not seen.
+            let age = 1 + states.clone().take_while(|s| *s == Some(state)).count();
+            let other = states.nth(age - 1).flatten()?;
+            (other != LightState::Unknown).then_some(age)
+        };
+        let lights = now.lights().iter();
+        let ages = lights.filter_map(|light| Some((light.lane, age(light.lane, light.state)?)));
+        Self(ages.collect())
+    }
+
     /// Of a light that was not seen to change: as if it might just now.
     fn age(&self, lane: LaneId) -> usize {
         self.0.get(&lane).copied().unwrap_or(LEAST)
@@ -166,7 +184,7 @@ fn next_light(
 #[cfg(test)]
 mod tests {
     use LightState::{Green, Red, Unknown, Yellow};
-    use gump_scene::Seed;
+    use gump_scene::{Light, Seed};
 
     use super::*;
 
@@ -183,6 +201,27 @@ mod tests {
         assert!((share(1.0, LEAST) - 0.5).abs() < 0.03);
         assert!((share(0.25, LEAST) - 0.2).abs() < 0.03);
         assert_eq!((share(0.0, LEAST), share(1.0, LEAST - 1)), (0.0, 0.0));
+    }
+
+    #[test]
+    fn changes_that_were_seen_count() {
+        let frame = |states: [LightState; 3]| {
+            let lights = states.iter().zip(1..).map(|(state, lane)| Light {
+                lane: LaneId(lane),
+                state: *state,
+                stop_point: None,
+            });
+            Frame::new(Vec::new(), lights.collect())
+        };
+        let phases = Phases::of(&[
+            frame([Green, Red, Unknown]),
+            frame([Green, Red, Green]),
+            frame([Yellow, Red, Green]),
+            frame([Yellow, Green, Green]),
+        ]);
+        let ages = [1, 2, 3].map(|lane| phases.age(LaneId(lane)));
+        assert_eq!(ages, [2, 1, LEAST]);
+        assert_eq!(Phases::of(&[]).age(LaneId(1)), LEAST);
     }
 
     #[test]
