@@ -18,10 +18,11 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use gump_geometry::OrientedBox;
-use gump_scene::{AgentKind, AgentState, Frame, Light, Seed};
-use gump_tokenizer::{Key, TokenAgent, TokenFrame};
+use gump_scene::{Agent, AgentId, AgentKind, AgentState, Frame, Light, Seed};
+use gump_tokenizer::{Key, QuantizedState, TokenAgent, TokenFrame};
 
 pub(crate) use crate::spawning::lights::Phases;
+use gump_model::config::KEEP_RANGE_M;
 use gump_model::decoder::STEPS;
 use gump_model::local_frame::LocalFrame;
 use gump_model::placed_slot::{PlacedSlot, place_exactly};
@@ -49,6 +50,17 @@ const TRIES: u64 = 6;
 /// No agent enters or leaves nearer to the ego than this, metres: half of the window, so that it
 /// does not happen in view. Not tuned.
 const SEEN_M: f64 = 50.0;
+
+/// Gaps ahead and behind that a new vehicle or bicycle needs, metres, and what is left of a gap
+/// where both stop; those of `gump_traffic::Arrivals`.
+const LEAST_GAP_M: f64 = 7.0;
+const LEAST_REAR_M: f64 = 10.0;
+const LEFT_M: f64 = 2.0;
+/// Braking with which a new agent and who is behind it can stop, m/s², and their headway, seconds.
+const GENTLE_MPS2: f64 = 1.5;
+const HEADWAY_S: f64 = 1.0;
+/// Who is this near to the side of a new agent's way is in it, metres. Chosen by hand.
+const BESIDE_M: f64 = 0.5;
 
 /// The purpose of a decision, as the part of a seed; beyond the indices that other seeds are forked
 /// by.
@@ -284,7 +296,9 @@ impl TransformerSession<'_> {
                 let ego = future.last_frame().and_then(|frame| frame.tracked.first());
                 let ego = ego.map_or_else(Default::default, |ego| ego.state.pose().position);
                 let is_far = state.pose().position.distance(ego) >= SEEN_M;
+                let newborn = placed((agent, key.kind), &state, scene);
                 is_far
+                    && has_headway(&newborn, &frames[f])
                     && rules.enters(&state)
                     && rules
                         .broken(&state, &box_of(&state), &scene.map, scene.world_from_scene)
@@ -306,14 +320,8 @@ impl TransformerSession<'_> {
             let now = Arc::make_mut(now);
             now.newborn.push(token);
             now.newborn.sort_by_key(|agent| agent.key);
-            let own = box_of(&state);
-            let state = AgentState {
-                pose: scene.world_from_scene * state.pose(),
-                velocity: scene.world_from_scene.rotate(state.velocity()),
-            };
-            let size = [own.length, own.width];
             let mut agents = frames[f].agents().to_vec();
-            agents.push(agent_of(agent, key.kind, size, state, &scene.map));
+            agents.push(placed((agent, key.kind), &state, scene));
             frames[f] = Frame::new(agents, frames[f].lights().to_vec());
             if let Some(now) = future.recent.last_mut() {
                 *now = frames[f].clone();
@@ -321,6 +329,43 @@ impl TransformerSession<'_> {
         }
         Ok(())
     }
+}
+
+/// A new agent in the world.
+fn placed((id, kind): (AgentId, AgentKind), state: &QuantizedState, scene: &SceneContext) -> Agent {
+    let own = box_of(state);
+    let state = AgentState {
+        pose: scene.world_from_scene * state.pose(),
+        velocity: scene.world_from_scene.rotate(state.velocity()),
+    };
+    agent_of(id, kind, [own.length, own.width], state, &scene.map)
+}
+
+/// Whether a new vehicle or bicycle has room to stop before whatever is ahead of it, and who moves
+/// behind it has room to stop as well.
+fn has_headway(newborn: &Agent, frame: &Frame) -> bool {
+    let speed = newborn.state.speed();
+    // That a gap is enough from one speed behind another.
+    let suffices = |gap: f64, behind: f64, ahead: f64| {
+        let room = (gap - LEFT_M).max(0.0);
+        behind * HEADWAY_S <= room && behind * behind <= ahead * ahead + 2.0 * GENTLE_MPS2 * room
+    };
+    let has_room = |other: &Agent| {
+        let local = newborn.state.pose.inverse() * other.state.pose.position;
+        let beside = (newborn.width + other.width) / 2.0 + BESIDE_M;
+        if local.y.abs() > beside {
+            return true;
+        }
+        let gap = local.x.abs() - (newborn.length + other.length) / 2.0;
+        let along = other.state.velocity.dot(newborn.state.pose.direction());
+        let along = along.max(0.0);
+        if local.x > 0.0 {
+            gap >= LEAST_GAP_M && suffices(gap, speed, along)
+        } else {
+            !other.kind.is_moving() || gap >= LEAST_REAR_M && suffices(gap, along, speed)
+        }
+    };
+    newborn.kind == AgentKind::Pedestrian || frame.agents().iter().all(has_room)
 }
 
 /// Index of BEGIN of a window's next frame; its lights follow.
@@ -335,8 +380,8 @@ impl RolloutState {
         stream(self.seed, self.index, 0).fork(about as u64)
     }
 
-    /// The frame without the agents whose tokens were removed, with its lights as drawn; their ids
-    /// are free once no frame of the window has them.
+    /// The frame without the agents whose tokens were removed and those that move away outside the
+    /// window, with its lights as drawn; their ids are free once no frame of the window has them.
     fn without_the_gone(&mut self, frame: &Frame, scene: &SceneContext) -> Frame {
         let n = self.frames.len();
         let ids = |frame: Option<&TokenFrame>| -> BTreeSet<u16> {
@@ -348,9 +393,22 @@ impl RolloutState {
             ids(self.last_frame()),
         );
         let gone = |id: &u16| before.contains(id) && !now.contains(id);
-        let stays = |agent: &&gump_scene::Agent| {
+        let ego = frame.agent(scene.ego).map(|ego| scene.local(ego.state));
+        let ego = ego.unwrap_or_default().pose.position;
+        // A change of scenes leaves agents behind without a token, and they would drift on for ever.
+        let drifts_off = |agent: &Agent| {
+            let local = scene.local(agent.state);
+            let at = local.pose.position;
+            let is_beyond = at.abs().max_element() >= KEEP_RANGE_M;
+            is_beyond && local.velocity.dot(at - ego) > 0.0
+        };
+        let stays = |agent: &&Agent| {
             let id = self.identities.key(agent.id);
-            id.is_none_or(|id| id == 0 || !gone(&id))
+            let has_token = id.is_some_and(|id| now.contains(&id));
+            id == Some(0)
+                || has_token
+                || !agent.kind.is_moving()
+                || !id.is_some_and(|id| gone(&id)) && !drifts_off(agent)
         };
         let agents = frame.agents().iter().filter(stays).copied().collect();
         let tokens = self.last_frame().map_or(&[][..], |frame| &frame.lights);
@@ -398,10 +456,18 @@ impl RolloutState {
     }
 
     /// The constraints of a new agent: positions where lanes or walkways enter the window, clear of
-    /// all agents.
-    fn rules(&self, kind: AgentKind, scene: &SceneContext) -> Rules {
-        let now = self.last_frame().into_iter().flat_map(TokenFrame::agents);
-        let taken: Vec<OrientedBox> = now.map(|agent| box_of(&agent.state)).collect();
+    /// all agents and things of the present, with tokens or without.
+    pub(crate) fn rules(&self, kind: AgentKind, scene: &SceneContext) -> Rules {
+        let scene_from_world = scene.world_from_scene.inverse();
+        let local = |agent: &Agent| {
+            let own = agent.oriented_box();
+            OrientedBox {
+                pose: scene_from_world * own.pose,
+                ..own
+            }
+        };
+        let now = self.recent.last().map_or(&[][..], Frame::agents);
+        let taken: Vec<OrientedBox> = now.iter().map(local).collect();
         let ego = self.last_frame().and_then(|frame| frame.tracked.first());
         let ego = ego.map(|ego| (ego.state.pose().position, ego.state.velocity()));
         Rules {
@@ -415,5 +481,37 @@ impl RolloutState {
             manner: Manner::default(),
             places: None,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use gump_scene::fixture;
+
+    use super::*;
+
+    /// Whether vehicle 1 may enter where it is, at 10 m/s, with another object of the scene.
+    fn may_enter(other: &str) -> bool {
+        let text =
+            format!("ego vehicle 0: 0,0\nagent vehicle 1: -90,0 velocity 10,0 size 4,2\n{other}");
+        let scenario = fixture::scenario(&text).unwrap();
+        let now = scenario.present().now();
+        let newborn = now.agent(AgentId(1)).unwrap();
+        let others = now.agents().iter().filter(|agent| agent.id.0 > 1);
+        has_headway(newborn, &Frame::new(others.copied().collect(), Vec::new()))
+    }
+
+    #[test]
+    fn who_enters_has_room_ahead_and_behind() {
+        // 10 m/s take 33 m to stop, and 2 m are left.
+        assert!(!may_enter("agent cone 2: -60,0") && may_enter("agent cone 2: -50,0"));
+        assert!(may_enter("agent cone 2: -60,2.2") && may_enter("agent cone 2: -95,0"));
+        // Behind one that goes as fast a second is enough.
+        assert!(may_enter("agent vehicle 2: -73,0 velocity 10,0 size 4,2"));
+        assert!(!may_enter("agent vehicle 2: -76,0 velocity 10,0 size 4,2"));
+        // One that comes from behind.
+        assert!(!may_enter("agent vehicle 2: -110,0 velocity 15,0 size 4,2"));
+        assert!(may_enter("agent vehicle 2: -150,0 velocity 15,0 size 4,2"));
+        assert!(!may_enter("agent vehicle 2: -102,0 size 4,2"));
     }
 }

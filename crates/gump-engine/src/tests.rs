@@ -428,6 +428,51 @@ fn traffic_may_come_and_go_at_the_edge() {
 }
 
 #[test]
+fn with_arrivals_who_drives_away_outside_of_the_window_leaves() {
+    let scenario = fixture::scenario(
+        "lane 1: -400,0 400,0
+         ego vehicle 0: 0,0
+         agent vehicle 1: 150,0 velocity 12,0
+         agent vehicle 2: -150,0 velocity 12,0
+         agent vehicle 3: 150,6
+         agent cone 4: 20,6",
+    )
+    .unwrap();
+    let sampling = SamplingConfig {
+        spawn: true,
+        ..SamplingConfig::default()
+    };
+    let (frames, _) = imagine(sampling, &scenario, 1, 1, None);
+    let is_there = |id: i64| frames[0][0].agent(AgentId(id)).is_some();
+    assert_eq!(
+        [0, 1, 2, 3, 4].map(is_there),
+        [true, false, true, true, true]
+    );
+}
+
+#[test]
+fn new_agents_keep_clear_of_what_has_no_token() {
+    let scenario = fixture::scenario(
+        "lane 1: -400,0 400,0
+         ego vehicle 0: 0,0
+         agent vehicle 1: 30,0
+         agent vehicle 2: 150,0
+         agent cone 3: 80,0",
+    )
+    .unwrap();
+    let world = TransformerWorld::new(network(), SamplingConfig::default());
+    let start = Start {
+        scene: scenario.present(),
+        n_futures: 1,
+        seed: Seed(5),
+    };
+    let session = world.open_session(&[start]).unwrap();
+    let future = &session.futures[0];
+    let rules = future.rules(gump_scene::AgentKind::Vehicle, &session.scenes[0]);
+    assert_eq!(rules.taken.len(), 4);
+}
+
+#[test]
 fn a_crowd_of_500_is_imagined_whole() {
     let mut text = String::from("lane 1: -100,0 100,0\nego vehicle 0: 0,0 velocity 5,0\n");
     for i in 1..500 {
