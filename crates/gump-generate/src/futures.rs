@@ -28,13 +28,16 @@ const AGAIN: u64 = 1 << 20;
 
 /// Whether no agents overlap from the present of a scenario on.
 pub(super) fn stays_clear(scenario: &Scenario) -> bool {
-    are_clear(&scenario.log[scenario.now..], scenario.dt)
+    are_clear(&scenario.log[scenario.now..], 0, scenario.dt)
 }
 
-/// Whether no agents overlap in these frames, looked at as often as [`through_time`] does.
-fn are_clear(frames: &[Frame], dt: f64) -> bool {
+/// Whether no agents overlap in these frames, which begin so many frames after the present; looked
+/// at at the instants at which [`through_time`] does, and at the end.
+fn are_clear(frames: &[Frame], since: usize, dt: f64) -> bool {
     let stride = (LOOK_S / dt).round().max(1.0) as usize;
-    let mut looked_at = frames.iter().step_by(stride).chain(frames.last());
+    let first = since.next_multiple_of(stride) - since;
+    let looked_at = frames.iter().skip(first).step_by(stride);
+    let mut looked_at = looked_at.chain(frames.last());
     looked_at.all(|frame| overlaps_in(frame) == 0)
 }
 
@@ -122,6 +125,7 @@ pub(super) fn extend(
     if missing == 0 {
         return Ok(());
     }
+    let since = scenario.log.len() - scenario.now;
     let mut first = None;
     for attempt in 0..FUTURES as u64 {
         let start = Start {
@@ -135,7 +139,7 @@ pub(super) fn extend(
         };
         let rollouts = imagine(world, &[start], None, missing as f64 * scenario.dt)?;
         let future = rollouts.first().map_or(&[][..], Rollout::imagined);
-        let is_clear = are_clear(future, scenario.dt);
+        let is_clear = are_clear(future, since, scenario.dt);
         if is_clear || first.is_none() {
             first = Some(future.to_vec());
         }
@@ -250,6 +254,24 @@ mod tests {
         }
         let gathered = with_overlap(&scene);
         assert!(!stays_clear(&gathered));
+    }
+
+    #[test]
+    fn a_continuation_is_looked_at_when_the_whole_is() {
+        let text = "ego vehicle 0: 0,0\nagent vehicle 1: 20,0\nhistory 0 future 2 dt 0.1";
+        let scene = fixture::scenario(text).unwrap();
+        let (clear, gathered) = (scene.log[0].clone(), with_overlap(&scene));
+        let overlap = gathered.log[gathered.log.len() - 1].clone();
+        for n in 1..12 {
+            for k in 0..n {
+                let mut whole = scene.clone();
+                let mut future = vec![clear.clone(); n];
+                future[k] = overlap.clone();
+                whole.log.extend_from_slice(&future);
+                let is_clear = are_clear(&future, scene.log.len() - scene.now, scene.dt);
+                assert_eq!(is_clear, stays_clear(&whole), "frame {k} of {n}");
+            }
+        }
     }
 
     /// The scene with a last frame in which all are in one place.
