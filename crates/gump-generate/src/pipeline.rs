@@ -171,7 +171,7 @@ pub fn make(
                 let is_of_place = match error {
                     GenerateError::NoLane | GenerateError::NoPlace { .. } => true,
                     // At this place no object may be where the prompt requires one.
-                    GenerateError::Constraints(_) => site.is_some(),
+                    GenerateError::Constraints(_) => site.is_some() || order.roams,
                     _ => false,
                 };
                 if !is_of_place {

@@ -45,6 +45,9 @@ impl<'a> Prepared<'a> {
         world: &TransformerWorld,
         request: &'a GenerateRequest,
     ) -> Result<Self, GenerateError> {
+        if request.config.tries == 0 {
+            return Err(GenerateError::NoTries);
+        }
         let mut objects = request.objects.clone();
         constraint::check(&objects)?;
         constraint::mutual(&mut objects);

@@ -149,7 +149,7 @@ pub struct GenerateConfig {
     pub prompt_tokens: bool,
     /// Whether the ego may be steered where no rollout satisfies the prompts.
     pub steers: bool,
-    /// Draws per object before the scene is started again.
+    /// Draws per object before the scene is started again; at least one.
     pub tries: usize,
     /// Restarts of a scene before it is given up.
     pub restarts: usize,
@@ -295,6 +295,9 @@ pub enum GenerateError {
         /// The maximum.
         max: usize,
     },
+    /// No draws are allowed.
+    #[error("tries is 0, expected at least one draw per object")]
+    NoTries,
     /// No valid state was found for an object.
     #[error(
         "{object} found no place in {scenes} scenes begun with {tries} draws each; most often it \

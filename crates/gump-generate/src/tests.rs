@@ -166,6 +166,32 @@ fn what_cannot_be_met_is_said() {
     let mut nowhere = request(Vec::new());
     nowhere.map = fixture::scenario("ego vehicle 0: 0,0").unwrap().map;
     assert!(error(&nowhere).contains("no drivable lane"));
+    let mut never = request(Vec::new());
+    never.config.tries = 0;
+    assert!(error(&never).contains("tries is 0"));
+}
+
+#[test]
+fn another_start_is_tried_where_a_wish_cannot_be_met() {
+    // Only one that starts before x = 40 has such a place ahead.
+    let wish = "[[object]]\nid = \"a\"\nlane = 1\nx = [60, 90]\ny = [-1, 1]";
+    let mut request = request(parse_constraints(wish).unwrap());
+    request.counts = None;
+    request.config.max_agents = 1;
+    let order = pipeline::GenerationJob {
+        request,
+        roams: true,
+        seconds: 0.0,
+        attempts: 40,
+    };
+    let world = world();
+    let worlds = pipeline::GenerationWorlds::of(&world);
+    let made = pipeline::make_many(worlds, &order, 0..4, Seed(1)).unwrap();
+    let attempts: Vec<usize> = made
+        .into_iter()
+        .map(|made| made.unwrap().attempts)
+        .collect();
+    assert!(attempts.iter().any(|n| *n > 1), "{attempts:?}");
 }
 
 #[test]
