@@ -125,6 +125,17 @@ impl PlannedDrive {
         Some(drive)
     }
 
+    /// The same way at another speed at the beginning, metres per second; `None` if it is too short
+    /// for that.
+    pub(crate) fn at_speed(&self, speed: f64) -> Option<Self> {
+        let drive = Self {
+            speed,
+            ..self.clone()
+        };
+        let needed = drive.from + drive.metres_after(PLANNED_S) + AXLE_M;
+        (drive.path.length() >= needed - ENDS_M).then_some(drive)
+    }
+
     /// The state after so many seconds, box centre, world frame.
     pub(crate) fn state_after(&self, seconds: f64) -> AgentState {
         let pose = self.pose_ahead(self.metres_after(seconds));
@@ -324,6 +335,21 @@ mod tests {
             stop_point: None,
         }];
         assert!(drive.runs_red(&red, 4.8) && !drive.runs_red(&[], 4.8));
+    }
+
+    #[test]
+    fn another_speed_needs_as_long_a_way() {
+        let drive = drive(50.0, 6.0, Maneuver::default()).unwrap();
+        assert_eq!(drive.at_speed(8.0).unwrap().speed, 8.0);
+        // 50 m are left.
+        assert!(drive.at_speed(11.0).is_none());
+        let red = [Light {
+            lane: LaneId(3),
+            state: LightState::Red,
+            stop_point: None,
+        }];
+        let passes = |speed| drive.at_speed(speed).unwrap().runs_red(&red, 4.8);
+        assert!(passes(6.0) && !passes(1.0));
     }
 
     #[test]

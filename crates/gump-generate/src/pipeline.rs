@@ -299,10 +299,13 @@ fn judged(
         }
         let mut found = found.or(first);
         if let (None, Some(site), true) = (&found, site, order.request.config.steers) {
-            let drive = site.drive_from(checked.scenario.present().ego_now());
-            let steered = futures::steered(world, &checked.scenario, &drive, stream.fork(3))?;
-            found = futures::moment(steered, holds);
-            checked.is_steered = found.is_some();
+            let present = checked.scenario.present();
+            let drive = site.drive_from(present.ego_now(), present.now().lights());
+            if let Some(drive) = drive {
+                let steered = futures::steered(world, &checked.scenario, &drive, stream.fork(3))?;
+                found = futures::moment(steered, holds);
+                checked.is_steered = found.is_some();
+            }
         }
         if let Some((scenario, seconds)) = found {
             (checked.scenario, checked.moment_s) = (scenario, seconds);

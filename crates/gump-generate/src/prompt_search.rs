@@ -53,9 +53,8 @@ impl Search<'_> {
         lanes.retain(|(lane, _)| lane.kind != LaneKind::BikeLane);
         for _ in 0..TRIALS {
             let (lane, on) = lanes.choose(rng)?;
-            let site = self.site((lane, on.along_m), on.lateral_m, rng);
-            if let Some(mut site) = site.filter(|site| self.holds(site)) {
-                site.ego.pose = pose;
+            let site = self.site((lane, on.along_m), Some(pose), rng);
+            if let Some(site) = site.filter(|site| self.holds(site)) {
                 return Some(site);
             }
         }
@@ -83,7 +82,7 @@ impl Search<'_> {
             for &(lane, at) in &places {
                 let at = at + rng.random_range(0.0..SPACING_M);
                 let at = at.min(lane.centerline.length());
-                let site = self.site((lane, at), 0.0, rng);
+                let site = self.site((lane, at), None, rng);
                 if let Some(site) = site.filter(|site| self.holds(site)) {
                     return Some(site);
                 }
@@ -92,8 +91,8 @@ impl Search<'_> {
         None
     }
 
-    fn site(&self, place: (&Lane, f64), offset: f64, rng: &mut Rng) -> Option<Site> {
-        Site::set(self.cast, self.request, place, offset, rng)
+    fn site(&self, place: (&Lane, f64), pose: Option<Pose>, rng: &mut Rng) -> Option<Site> {
+        Site::set(self.cast, self.request, place, pose, rng)
     }
 
     /// Whether all tags hold at the same instant of the trial.
@@ -147,7 +146,7 @@ mod tests {
 
     use gump_engine::placement::object_spec::{Bounds, ObjectSpec, Relation};
     use gump_geometry::DVec2;
-    use gump_scene::{LaneId, MapParts, StopSign, fixture};
+    use gump_scene::{AreaKind, LaneId, MapParts, StopSign, fixture};
 
     use super::*;
     use crate::GenerateConfig;
@@ -289,6 +288,30 @@ mod tests {
         assert!((4.5..9.0).contains(&directed.ego.velocity.unwrap().length()));
         assert_eq!(directed.objects.len(), 1);
         assert!(here("starting_left_turn").is_none());
+    }
+
+    #[test]
+    fn what_is_placed_at_a_pose_askew_is_relative_to_that_pose() {
+        let mut request = request("crosswalk: -56,-6 -51,-6 -51,6 -56,6", |_| ());
+        request.ego.pose = Pose::new(-60.0, 0.5, 0.35);
+        let tags = ["near_pedestrian_on_crosswalk", "low_magnitude_speed"];
+        let prompts = tags.map(|tag| tag.parse().unwrap());
+        let search = Search {
+            cast: &PromptSpec::of(&prompts),
+            request: &request,
+            prompts: &prompts,
+        };
+        let site = search.here(Seed(1)).unwrap();
+        assert_eq!(site.ego.pose, request.ego.pose);
+        let velocity = site.ego.velocity.unwrap();
+        let ahead = site.ego.pose.direction() * velocity.length();
+        assert!(velocity.distance(ahead) < 1e-9, "{velocity}");
+        let person = site.objects.last().unwrap();
+        let middle = |bounds: Option<Bounds>| bounds.unwrap().low + 0.25;
+        let at = site.ego.pose * DVec2::new(middle(person.x), middle(person.y));
+        let walks = request.map.areas().iter();
+        let mut walks = walks.filter(|area| area.kind == AreaKind::Crosswalk);
+        assert!(walks.any(|area| area.polygon.contains(at)), "{at}");
     }
 
     #[test]

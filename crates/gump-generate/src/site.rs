@@ -5,7 +5,9 @@ use std::sync::Arc;
 
 use gump_engine::placement::object_spec::{Bounds, Class, ObjectSpec};
 use gump_geometry::{DVec2, OrientedBox, Pose};
-use gump_scene::{Agent, AgentId, AgentKind, AgentState, Frame, Lane, MapGraph, Rng, Scenario};
+use gump_scene::{
+    Agent, AgentId, AgentKind, AgentState, Frame, Lane, Light, MapGraph, Rng, Scenario,
+};
 use rand::Rng as _;
 use rand::seq::IndexedRandom as _;
 
@@ -53,13 +55,13 @@ enum Way {
 }
 
 impl Site {
-    /// Places all agents around the ego at a position, this many metres left of the middle of a
-    /// lane; `None` where that is impossible.
+    /// Places all agents around an ego on a lane: in the lane's direction and in its middle, or at
+    /// `pose`, which is beside that place. `None` where that is impossible.
     pub(crate) fn set(
         cast: &PromptSpec,
         request: &GenerateRequest,
         place: (&Lane, f64),
-        offset: f64,
+        pose: Option<Pose>,
         rng: &mut Rng,
     ) -> Option<Self> {
         let map: &MapGraph = &request.map;
@@ -70,12 +72,13 @@ impl Site {
             .or_else(|| Some(drawn(wished?, rng)))
             .unwrap_or_else(|| rng.random_range(3.0..8.0));
         let maneuver = cast.maneuver(rng);
+        let offset = pose.map_or(0.0, |pose| place.0.foot(pose).lateral_m);
         let drive = PlannedDrive::along(map, place, offset, speed, maneuver, rng)?;
         if drive.runs_red(&request.lights, request.ego.length) {
             return None;
         }
         let mut ego = request.ego;
-        ego.pose = drive.pose_ahead(0.0);
+        ego.pose = pose.unwrap_or_else(|| drive.pose_ahead(0.0));
         if ego.velocity.is_none() && wished.is_some() {
             ego.velocity = Some(ego.pose.direction() * speed);
         }
@@ -102,11 +105,11 @@ impl Site {
         Some(site)
     }
 
-    /// The drive of the ego in a scene generated here: at its own speed, if that was open.
-    pub(crate) fn drive_from(&self, ego: &Agent) -> PlannedDrive {
-        let mut drive = self.drive.clone();
-        drive.speed = ego.state.speed();
-        drive
+    /// The drive of the ego in a scene generated here: at its own speed, if that was open. `None` if
+    /// at that speed the road ends too early or the ego passes one of the lights at red.
+    pub(crate) fn drive_from(&self, ego: &Agent, lights: &[Light]) -> Option<PlannedDrive> {
+        let drive = self.drive.at_speed(ego.state.speed())?;
+        (!drive.runs_red(lights, ego.length)).then_some(drive)
     }
 
     /// The request for a scene at this place.
