@@ -26,6 +26,10 @@ const REACH_M: f64 = 70.0;
 const OFF_ROAD_M: f64 = 3.4;
 /// Distance kept to standing and to moving agents, metres. Chosen by eye.
 const ROOM_M: [f64; 2] = [0.15, 0.8];
+/// Speed of the first part of a way out of a place, or the last one into it, in reverse as well, and
+/// of the other part, m/s.
+const NEAR_PLACE_MPS: std::ops::Range<f64> = 0.8..2.0;
+const ON_WAY_MPS: std::ops::Range<f64> = 2.0..5.5;
 /// From the middle of a vehicle to its rear axle, as a share of its length: 1.46 m of 5.18 m in
 /// nuPlan's Pacifica.
 const REAR_AXLE: f64 = 0.28;
@@ -72,16 +76,21 @@ fn path(parked: Pose, length: f64, n: usize, dt: f64, rng: &mut Rng) -> Vec<Pose
     let axle = REAR_AXLE * length;
     let mut rear = parked * Pose::new(-axle, 0.0, 0.0);
     let centre = |rear: Pose| rear * Pose::new(axle, 0.0, 0.0);
+    // An arrival is driven backwards in time, so its gears are the other ones here.
+    let arrives = rng.random_bool(0.45);
     let backs_out = rng.random_bool(0.65);
     let side = if rng.random_bool(0.5) { 1.0 } else { -1.0 };
     // First out of the place, then on its way.
     let first_gear = if backs_out { -1.0 } else { 1.0 };
+    let second_gear = if arrives { -1.0 } else { 1.0 };
+    let changes_gear = backs_out != arrives;
     let first_metres = rng.random_range(4.0..8.5);
-    let first_speed: f64 = rng.random_range(0.8..2.2);
+    let first_speed: f64 = rng.random_range(NEAR_PLACE_MPS);
     let straight = rng.random_range(0.5..3.0);
     let first_turn = side * rng.random_range(0.08..CURVATURE);
-    let mut second_turn = -side * first_gear * rng.random_range(-0.05..CURVATURE);
-    let second_speed = rng.random_range(2.0..5.5);
+    // The other way: after a change of gear the vehicle turns on, else it straightens.
+    let mut second_turn = -side * rng.random_range(-0.05..CURVATURE);
+    let second_speed = rng.random_range(ON_WAY_MPS);
     let pause = rng.random_range(0.3..1.6);
     let haste = rng.random_range(0.5..1.3);
     let starts = rng.random_range(-0.6..0.85) * n as f64 * dt;
@@ -99,7 +108,7 @@ fn path(parked: Pose, length: f64, n: usize, dt: f64, rng: &mut Rng) -> Vec<Pose
         let (gear, wanted, aim) = if leaving {
             let left = first_metres - driven;
             // It stops at the end of the first part if it has to change gear.
-            let stops = if backs_out {
+            let stops = if changes_gear {
                 (1.6 * left).sqrt() + 0.05
             } else {
                 f64::INFINITY
@@ -107,14 +116,14 @@ fn path(parked: Pose, length: f64, n: usize, dt: f64, rng: &mut Rng) -> Vec<Pose
             let aim = if driven < straight { 0.0 } else { first_turn };
             (first_gear, first_speed.min(stops), aim)
         } else {
-            if backs_out && paused < pause {
+            if changes_gear && paused < pause {
                 (paused, speed) = (paused + dt, 0.0);
                 continue;
             }
             second_turn *= 1.0 - 0.25 * dt;
             second_turn += rng.random_range(-0.06..0.06) * dt.sqrt();
             second_turn = second_turn.clamp(-CURVATURE, CURVATURE);
-            (1.0, second_speed, second_turn)
+            (second_gear, second_speed, second_turn)
         };
         speed += (wanted - speed).clamp(-2.0 * dt, haste * dt);
         turn += (aim - turn).clamp(-0.15 * dt, 0.15 * dt);
@@ -127,7 +136,7 @@ fn path(parked: Pose, length: f64, n: usize, dt: f64, rng: &mut Rng) -> Vec<Pose
             heading: wrap_angle(rear.heading + bent),
         };
     }
-    if rng.random_bool(0.45) {
+    if arrives {
         poses.reverse();
     }
     poses
@@ -173,4 +182,24 @@ pub(super) fn is_clear(
             at.position.distance(pose.position) >= near || !own(pose).overlaps(&theirs)
         })
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use gump_scene::Seed;
+
+    #[test]
+    fn nobody_reverses_fast() {
+        let dt = 0.1;
+        for seed in 0..200 {
+            let mut rng = Seed(seed).rng();
+            let poses = path(Pose::new(3.0, -2.0, 0.7), 4.7, 91, dt, &mut rng);
+            for pair in poses.windows(2) {
+                let step = pair[1].position - pair[0].position;
+                let ahead = step.dot(pair[0].direction()) / dt;
+                assert!((-2.05..5.6).contains(&ahead), "seed {seed}: {ahead} m/s");
+            }
+        }
+    }
 }
