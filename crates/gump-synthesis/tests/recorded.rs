@@ -62,6 +62,9 @@ fn every_scene_is_a_valid_scenario() {
             );
         }
         assert_eq!(clean.id, seen.id);
+        for scene in [clean, &seen] {
+            assert_eq!(scene.tags, gump_metrics::tags::extract_tags(scene));
+        }
         assert!(clean.id.starts_with("like-"));
     }
 }

@@ -65,7 +65,7 @@ impl Tracker {
 ///
 /// The ego is always present, with the errors of its own motion only; static agents (cones, signs)
 /// are not changed. Targets and objects of interest that are not visible at the present are
-/// dropped.
+/// dropped, and the tags are those of what is visible.
 pub fn track(scenario: &mut Scenario, tracker: &Tracker, seed: Seed) {
     let seen = Sight::of(scenario, tracker, seed.fork(0));
     let mut noises: BTreeMap<AgentId, Noise> = BTreeMap::new();
@@ -101,6 +101,7 @@ pub fn track(scenario: &mut Scenario, tracker: &Tracker, seed: Seed) {
     let is_there = |id: &AgentId| now.agent(*id).is_some();
     scenario.targets.retain(is_there);
     scenario.objects_of_interest.retain(is_there);
+    scenario.tags = gump_metrics::tags::extract_tags(scenario);
 }
 
 /// Lights are visible from farther than boxes, because they face the traffic; a tenth is a
