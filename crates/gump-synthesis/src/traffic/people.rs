@@ -1,5 +1,6 @@
 //! Pedestrians: along sidewalks, around corners, and across the road when it is safe.
 
+use std::collections::VecDeque;
 use std::f64::consts::TAU;
 
 use gump_geometry::{DVec2, Pose, angle_difference, wrap_angle};
@@ -17,6 +18,21 @@ const CARROT: f64 = 1.6;
 const TURN_RATE: f64 = 1.6;
 /// Fastest change of walking speed, m/s².
 const CHANGE: f64 = 1.2;
+
+/// Metres between the rows of a group.
+const ROW: f64 = 1.35;
+/// Metres by which companions stand before or behind their row, and to the side of the one before
+/// them.
+const UNEVEN: f64 = 0.15;
+const BESIDE: std::ops::Range<f64> = 0.95..1.15;
+/// Metres between the places of a person that are kept, at least.
+const APART: f64 = 0.1;
+/// Greatest amplitude of swaying, metres.
+const SWAY: f64 = 0.14;
+/// How fast companions catch up, m/s per metre, and their greatest speed as a multiple of the
+/// leader's.
+const CATCH_UP: f64 = 0.8;
+const HASTE: f64 = 1.5;
 
 /// Share of those alone that run or ride a scooter, and their speed, m/s: of 766 pedestrians of
 /// `datasets/benchmarks/recorded.toml#train` 1.4 % move at 2 m/s and more, at most at 4.9. One in ten
@@ -39,6 +55,15 @@ pub(crate) enum Activity {
     },
 }
 
+/// Where people are along the walk over a crosswalk, and what they do there.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct OnCrosswalk {
+    /// Metres along the walk of the one ahead, and of the last one.
+    pub(crate) first: f64,
+    pub(crate) last: f64,
+    pub(crate) activity: Activity,
+}
+
 /// A person on a walk.
 #[derive(Clone, Debug)]
 pub(crate) struct Person {
@@ -56,17 +81,57 @@ pub(crate) struct Person {
     activity: Option<Activity>,
     gone: bool,
     companions: Vec<Companion>,
+    /// Where the person was, the latest last, as far back as companions follow.
+    trail: VecDeque<Pose>,
+    /// The last crosswalk of a group, where companions may still be.
+    left: Option<Left>,
     /// Amplitude of swaying to the sides, metres, and its initial phase.
     sway: (f64, f64),
 }
 
-/// A companion of a pedestrian, at about the same place beside or behind.
+/// A companion of a pedestrian, beside or behind on the same way.
 #[derive(Clone, Copy, Debug)]
 struct Companion {
     id: i64,
     size: [f64; 3],
-    /// Metres ahead and to the left of the person.
+    /// Metres of way ahead of the person, and metres to the left of it.
     place: DVec2,
+    pose: Pose,
+    speed: f64,
+}
+
+/// A crosswalk behind a person.
+#[derive(Clone, Copy, Debug)]
+struct Left {
+    /// Its walk and the direction.
+    way: (usize, bool),
+    /// Metres from its end to the start of the present walk.
+    since: f64,
+}
+
+impl Companion {
+    /// Walks on for `dt` seconds towards its place, which moves at `speed` metres per second.
+    fn follow(&mut self, place: Pose, speed: f64, dt: f64) {
+        let behind = (self.pose.inverse() * place.position).x;
+        let wanted = (speed + CATCH_UP * behind).clamp(0.0, HASTE * speed.max(1.0));
+        self.speed += (wanted - self.speed).clamp(-2.0 * CHANGE * dt, CHANGE * dt);
+        if self.speed < 0.02 {
+            return;
+        }
+        let to = place * DVec2::new(CARROT, 0.0) - self.pose.position;
+        stride(&mut self.pose, to, self.speed, dt);
+    }
+}
+
+/// Walks for `dt` seconds, turning towards a point `to` metres away; returns the displacement.
+fn stride(pose: &mut Pose, to: DVec2, speed: f64, dt: f64) -> DVec2 {
+    let turn = angle_difference(to.to_angle(), pose.heading);
+    // Turning on the spot would spin the box: the slower, the less it turns.
+    let most = TURN_RATE * dt * (speed / 0.6).min(1.0);
+    pose.heading = wrap_angle(pose.heading + (turn * 4.0 * dt).clamp(-most, most));
+    let step = pose.direction() * (speed * dt);
+    pose.position += step;
+    step
 }
 
 impl Person {
@@ -110,6 +175,8 @@ impl Person {
             activity: None,
             gone: false,
             companions: Vec::new(),
+            trail: VecDeque::new(),
+            left: None,
             sway: (0.0, 0.0),
         }
     }
@@ -117,7 +184,7 @@ impl Person {
     /// Lets others walk with the person: ids follow each other from `first_id` on.
     pub(crate) fn accompany(&mut self, first_id: i64, n: usize, rng: &mut Rng) {
         self.size = draw_person_size(rng);
-        self.sway = (rng.random_range(0.0..0.14), rng.random_range(0.0..TAU));
+        self.sway = (rng.random_range(0.0..SWAY), rng.random_range(0.0..TAU));
         if n == 0 && rng.random_bool(RUN) {
             self.pace = rng.random_range(RUN_MPS);
             self.speed = self.pace;
@@ -131,52 +198,117 @@ impl Person {
         for k in 0..n {
             let row = k.div_ceil(2) as f64;
             let side = if k % 2 == 0 { -1.0 } else { 0.0 };
+            let size = draw_person_size(rng);
+            let place = DVec2::new(
+                -ROW * row + rng.random_range(-UNEVEN..UNEVEN),
+                side * rng.random_range(BESIDE),
+            );
             self.companions.push(Companion {
                 id: first_id + k as i64,
-                size: draw_person_size(rng),
-                place: DVec2::new(
-                    -1.35 * row + rng.random_range(-0.15..0.15),
-                    side * rng.random_range(0.95..1.15),
-                ),
+                size,
+                place,
+                pose: Pose {
+                    position: self.pose * place,
+                    ..self.pose
+                },
+                speed: self.speed,
             });
         }
     }
 
     /// The boxes of those who walk with the person.
     pub(crate) fn companions(&self) -> impl Iterator<Item = Body> + '_ {
+        self.companions.iter().map(|companion| Body {
+            id: companion.id,
+            size: companion.size,
+            pose: companion.pose,
+            ..self.body()
+        })
+    }
+
+    /// Metres of way from the person to the last companion.
+    fn depth(&self) -> f64 {
+        let places = self.companions.iter().map(|companion| -companion.place.x);
         // Each drifts a little about its place as they walk.
-        let drift = |k: usize| {
+        places.map(|back| back + SWAY).fold(0.0, f64::max)
+    }
+
+    /// Where the person was `back` metres of way ago: straight behind its first place before that.
+    fn was(&self, back: f64) -> Pose {
+        let (mut at, mut left) = (self.pose, back);
+        for &earlier in self.trail.iter().rev() {
+            let step = at.position.distance(earlier.position);
+            if left <= step {
+                break;
+            }
+            (at, left) = (earlier, left - step);
+        }
+        at * Pose::new(-left, 0.0, 0.0)
+    }
+
+    /// Moves the companions on for `dt` seconds, each to where the person was, and to its side.
+    fn lead(&mut self, dt: f64) {
+        if self.companions.is_empty() {
+            return;
+        }
+        let last = self.trail.back();
+        if last.is_none_or(|last| last.position.distance(self.pose.position) > APART) {
+            self.trail.push_back(self.pose);
+        }
+        let most = (self.depth() / APART) as usize + 2;
+        while self.trail.len() > most {
+            self.trail.pop_front();
+        }
+        let mut companions = std::mem::take(&mut self.companions);
+        for (k, companion) in companions.iter_mut().enumerate() {
             let at = self.sway.1 + 1.7 * k as f64;
-            self.sway.0
+            let drift = self.sway.0
                 * DVec2::new(
                     (self.progress / 1.9 + at).sin(),
                     (self.progress / 2.6 - at).sin(),
-                )
-        };
-        self.companions
-            .iter()
-            .enumerate()
-            .map(move |(k, companion)| Body {
-                id: companion.id,
-                size: companion.size,
-                pose: Pose {
-                    position: self.pose * (companion.place + drift(k)),
-                    ..self.pose
-                },
-                ..self.body()
-            })
+                );
+            let place = companion.place + drift;
+            let on_way = self.was(-place.x);
+            let place = on_way * Pose::new(0.0, place.y, 0.0);
+            companion.follow(place, self.speed, dt);
+        }
+        self.companions = companions;
     }
 
-    /// The crosswalk the person is at, where along its walk, and what the person does there.
-    pub(crate) fn on_crosswalk(&self, network: &Network) -> Option<(usize, f64, Activity)> {
-        let walk = &network.walks[self.walk];
-        let length = walk.track.length();
-        let place = if self.forward {
-            self.progress
-        } else {
-            length - self.progress
-        };
-        Some((walk.crosswalk?, place, self.activity?))
+    /// Where the person and its companions are on this crosswalk.
+    pub(crate) fn on_crosswalk(
+        &self,
+        network: &Network,
+        crosswalk: usize,
+    ) -> impl Iterator<Item = OnCrosswalk> {
+        let here = self.activity.map(|activity| {
+            let way = (self.walk, self.forward);
+            (way, self.progress, activity)
+        });
+        let behind = self.left.and_then(|left| {
+            let since = left.since + self.progress;
+            let (walk, forward) = left.way;
+            let progress = network.walks[walk].track.length() + since;
+            let may_be_there = since < self.depth() + ROW;
+            may_be_there.then_some((left.way, progress, Activity::Crosses { forward }))
+        });
+        let places = [here, behind].into_iter().flatten();
+        let places =
+            places.filter(move |((walk, _), ..)| network.walks[*walk].crosswalk == Some(crosswalk));
+        places.map(|((walk, forward), progress, activity)| {
+            let track = &network.walks[walk].track;
+            let along = |s: f64| if forward { s } else { track.length() - s };
+            let (mut first, mut last) = (progress, progress);
+            for companion in &self.companions {
+                let progress = along(track.project(companion.pose.position));
+                (first, last) = (first.max(progress), last.min(progress));
+            }
+            OnCrosswalk {
+                first: along(first),
+                last: along(last),
+                activity,
+            }
+        })
     }
 
     /// True once the person has left the scene.
@@ -224,12 +356,7 @@ impl Person {
             return;
         }
         let to = self.carrot(network) + push - self.pose.position;
-        let turn = angle_difference(to.to_angle(), self.pose.heading);
-        // Turning on the spot would spin the box: the slower, the less it turns.
-        let most = TURN_RATE * dt * (self.speed / 0.6).min(1.0);
-        self.pose.heading = wrap_angle(self.pose.heading + (turn * 4.0 * dt).clamp(-most, most));
-        let step = self.pose.direction() * (self.speed * dt);
-        self.pose.position += step;
+        let step = stride(&mut self.pose, to, self.speed, dt);
         self.progress += step.dot(to.normalize_or_zero()).max(0.0);
     }
 }
@@ -246,6 +373,7 @@ impl TrafficSimulation<'_> {
             if person.progress >= length {
                 self.choose_walk(&mut person, length);
             }
+            person.lead(self.dt);
             self.people[i] = person;
         }
         self.people.retain(|person| !person.has_left());
@@ -354,8 +482,124 @@ impl TrafficSimulation<'_> {
             Some(crossing) => choices[crossing],
             None => choices[self.rng.random_range(0..choices.len())],
         };
+        let has_crossed = self.network.walks[from].crosswalk.is_some();
+        if has_crossed && !person.companions.is_empty() {
+            person.left = Some(Left {
+                way: (from, person.forward),
+                since: 0.0,
+            });
+        } else if let Some(left) = &mut person.left {
+            left.since += length;
+        }
         (person.walk, person.forward) = (walk, forward);
         person.progress -= length;
         person.activity = None;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use gump_scene::Seed;
+
+    use super::*;
+    use crate::RoadFamily;
+    use crate::layout::draw_plan;
+    use crate::traffic::{Demand, Scenery};
+
+    /// Looks at every step of a minute of people at crossings: before and after it.
+    fn watch(look: impl Fn(&[Person], &[Person], &Network)) {
+        for seed in 0..3 {
+            let mut rng = Seed(seed).rng();
+            let plan = draw_plan(RoadFamily::SignalizedCrossing, 120.0, &mut rng);
+            let network = Network::new(&plan, &mut rng);
+            let demand = Demand {
+                moving: 0,
+                parked: 0,
+                people: 12,
+                bicycles: 0,
+                arrivals: 0.0,
+                scenery: Scenery {
+                    is_real: true,
+                    ..Scenery::default()
+                },
+            };
+            let mut traffic = TrafficSimulation::new(&network, demand, DT, rng);
+            // Companions begin straight behind, wherever that is.
+            (0..100).for_each(|_| traffic.step());
+            for _ in 0..600 {
+                let before = traffic.people.clone();
+                traffic.step();
+                look(&before, &traffic.people, &network);
+            }
+        }
+    }
+
+    const DT: f64 = 0.1;
+
+    #[test]
+    fn companions_walk_where_they_face() {
+        watch(|before, after, _| {
+            let places: BTreeMap<i64, Pose> = before
+                .iter()
+                .flat_map(Person::companions)
+                .map(|body| (body.id, body.pose))
+                .collect();
+            for body in after.iter().flat_map(Person::companions) {
+                let Some(place) = places.get(&body.id) else {
+                    continue;
+                };
+                let velocity = (body.pose.position - place.position) / DT;
+                let aside = velocity.dot(body.pose.direction().perp()).abs();
+                assert!(aside < 0.15, "{aside} m/s to the side");
+                assert!(velocity.length() < 3.0, "{velocity}");
+            }
+        });
+    }
+
+    #[test]
+    fn companions_stay_together() {
+        watch(|_, people, _| {
+            for person in people {
+                for body in person.companions() {
+                    let apart = body.pose.position.distance(person.pose.position);
+                    assert!(apart < person.depth() + 2.0, "{apart} m");
+                }
+            }
+        });
+    }
+
+    #[test]
+    fn a_group_is_on_a_crosswalk_until_its_last_has_left() {
+        let seen = std::cell::Cell::new(0);
+        watch(|_, people, network| {
+            for person in people {
+                for body in person.companions() {
+                    for walk in &network.walks {
+                        let Some(crosswalk) = walk.crosswalk else {
+                            continue;
+                        };
+                        let (low, high) = network.crosswalks[crosswalk].on_road;
+                        let place = walk.track.project(body.pose.position);
+                        let foot = walk.track.pose_at(place).position;
+                        let is_on = (low + 0.6..high - 0.6).contains(&place)
+                            && foot.distance(body.pose.position) < 1.5;
+                        if !is_on {
+                            continue;
+                        }
+                        seen.set(seen.get() + 1);
+                        let covers = |at: OnCrosswalk| {
+                            let (from, to) = (at.first.min(at.last), at.first.max(at.last));
+                            matches!(at.activity, Activity::Crosses { .. })
+                                && (from..=to).contains(&place)
+                        };
+                        let mut at = person.on_crosswalk(network, crosswalk);
+                        assert!(at.any(covers), "at {place}");
+                    }
+                }
+            }
+        });
+        assert!(seen.get() > 100, "{}", seen.get());
     }
 }

@@ -269,26 +269,20 @@ impl TrafficSimulation<'_> {
             let passed = passes / (0.5 * vehicle.speed + 4.0);
             let spare = vehicle.driver.before_people;
             let before = spare.map_or(f64::INFINITY, |spare| FAST_WALK * (passed + spare));
-            self.people
-                .iter()
-                .all(|person| match person.on_crosswalk(self.network) {
-                    Some((crosswalk, place, activity)) if crosswalk == crossing.crosswalk => {
-                        match activity {
-                            Activity::Crosses { forward } => {
-                                let (low, high) = crossing.across;
-                                if forward {
-                                    place > high + PERSON_CLEARANCE || place < low - before
-                                } else {
-                                    place < low - PERSON_CLEARANCE || place > high + before
-                                }
-                            }
-                            Activity::Waits { may_go } => {
-                                !(may_go && (signalled || vehicle.driver.is_polite))
-                            }
-                        }
+            let at = self.people.iter();
+            let mut at =
+                at.flat_map(|person| person.on_crosswalk(self.network, crossing.crosswalk));
+            at.all(|at| match at.activity {
+                Activity::Crosses { forward } => {
+                    let (low, high) = crossing.across;
+                    if forward {
+                        at.last > high + PERSON_CLEARANCE || at.first < low - before
+                    } else {
+                        at.last < low - PERSON_CLEARANCE || at.first > high + before
                     }
-                    _ => true,
-                })
+                }
+                Activity::Waits { may_go } => !(may_go && (signalled || vehicle.driver.is_polite)),
+            })
         })
     }
 
