@@ -34,6 +34,7 @@ impl Recording {
             tracks: BTreeMap::new(),
             lights: Vec::new(),
         };
+        traffic.watch(recording.n_snapshots());
         for snapshot in 0..n_frames + 2 {
             if snapshot > 0 {
                 traffic.step();

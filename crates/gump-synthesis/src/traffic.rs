@@ -62,6 +62,8 @@ pub(crate) struct TrafficSimulation<'a> {
     next_id: i64,
     /// People who cross the road away from crosswalks.
     crossers: Vec<Crosser>,
+    /// Vehicles neither appear nor vanish at the ends of yards and car parks any more.
+    is_watched: bool,
 }
 
 impl<'a> TrafficSimulation<'a> {
@@ -80,6 +82,7 @@ impl<'a> TrafficSimulation<'a> {
             occupancy: Occupancy::new(network.lanes.len()),
             next_id: 0,
             crossers: Vec::new(),
+            is_watched: false,
         };
         traffic.populate();
         traffic
@@ -101,8 +104,12 @@ impl<'a> TrafficSimulation<'a> {
         for (vehicle, acceleration) in self.vehicles.iter_mut().zip(accelerations) {
             vehicle.advance(self.network, acceleration, self.dt, &mut self.rng);
         }
-        self.vehicles
-            .retain(|vehicle| !vehicle.has_left(self.network));
+        let mut vehicles = std::mem::take(&mut self.vehicles);
+        vehicles.retain(|vehicle| {
+            let parks = self.is_watched && self.is_inner(vehicle.lane());
+            parks || !vehicle.has_left(self.network)
+        });
+        self.vehicles = vehicles;
         self.time += self.dt;
         self.replenish();
     }
@@ -148,11 +155,11 @@ impl<'a> TrafficSimulation<'a> {
 
     fn acceleration(&mut self, i: usize) -> f64 {
         let vehicle = &self.vehicles[i];
-        if vehicle.is_held {
+        if vehicle.is_held || self.time < vehicle.starts {
             return -1.0;
         }
         let ahead = self.occupancy.leader(self.network, vehicle);
-        let stop = self.distance_to_stop(i);
+        let stop = self.distance_to_stop(i).or_else(|| self.distance_to_end(i));
         let speed = vehicle.allowed_speed(self.network);
         vehicle
             .driver

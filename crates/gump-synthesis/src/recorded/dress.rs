@@ -149,7 +149,7 @@ fn exit(rng: &mut Rng) -> Control {
     }
 }
 
-/// Adds a short way into a yard, in which vehicles disappear out of sight.
+/// Adds a short way into a yard, where vehicles come from and park.
 fn add_yard(plan: &mut Plan, at: (usize, f64, bool), extent: f64, rng: &mut Rng) -> bool {
     let style = RoadPlan {
         bays: false,

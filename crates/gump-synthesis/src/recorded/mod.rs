@@ -239,3 +239,44 @@ fn choose_ego<'a>(recording: &'a Recording, now: usize, rng: &mut Rng) -> Option
         first
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn vehicles_neither_appear_nor_vanish_in_yards_and_car_parks() {
+        let config = config();
+        let mut inner = 0;
+        for k in 0..12 {
+            let mut rng = Seed(31).fork(k).rng();
+            let mut plan = draw_plan(RoadFamily::Arterial, config.extent_m, &mut rng);
+            dress::dress(&mut plan, config.extent_m, &mut rng);
+            let (mut network, trimmed) = Network::roads(&plan, &mut rng);
+            network.lay_lots(&plan, &trimmed, 4, 1..=6, &mut rng);
+            let demand = Demand {
+                arrivals: 2.0,
+                ..draw_demand(&config, &network, (&[], &[]), &mut rng)
+            };
+            let mut traffic = TrafficSimulation::new(&network, demand, config.dt, rng);
+            for _ in 0..150 {
+                traffic.step();
+            }
+            let recording = Recording::make(&mut traffic, config.n_frames());
+            let last = recording.n_snapshots() - 1;
+            let is_inner =
+                |place: &(usize, f64)| network.lanes[place.0].speed_limit < CAR_PARK_SPEED;
+            for track in recording.tracks() {
+                let (Some(first), Some(end)) = (track.places().first(), track.places().last())
+                else {
+                    continue;
+                };
+                inner += usize::from(is_inner(first) || is_inner(end));
+                let appears = track.pose_at_snapshot(0).is_none() && is_inner(first);
+                let vanishes = track.pose_at_snapshot(last).is_none() && is_inner(end);
+                assert!(!appears && !vanishes, "scene {k}: {}", track.body.id);
+            }
+        }
+        assert!(inner > 10, "{inner}");
+    }
+}

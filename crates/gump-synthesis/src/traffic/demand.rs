@@ -168,6 +168,7 @@ impl TrafficSimulation<'_> {
     /// Adds new agents at the border.
     pub(super) fn replenish(&mut self) {
         let entries = (0..self.network.lanes.len()).filter(|&l| self.network.lanes[l].is_entry);
+        let entries = entries.filter(|&lane| !self.is_watched || !self.is_inner(lane));
         for lane in entries.collect::<Vec<_>>() {
             let arrives = self
                 .rng
@@ -184,6 +185,48 @@ impl TrafficSimulation<'_> {
         }
         if self.people.len() < self.demand.people && self.rng.random_bool(0.5 * self.dt) {
             self.add_person(Some(()));
+        }
+    }
+
+    /// True for lanes of yards and car parks in scenes like recorded ones, whose ends are in view.
+    pub(super) fn is_inner(&self, lane: LaneIdx) -> bool {
+        self.demand.scenery.is_real && self.network.lanes[lane].speed_limit < CAR_PARK_SPEED
+    }
+
+    /// Prepares for the next `n_steps` steps, which are seen: nobody appears or vanishes at the ends of
+    /// yards and car parks. Vehicles that would have come from there stand there until they set off,
+    /// and those that get there park.
+    pub(crate) fn watch(&mut self, n_steps: usize) {
+        if !self.demand.scenery.is_real {
+            return;
+        }
+        self.is_watched = true;
+        let can_park = |i: usize| {
+            let vehicle = &self.vehicles[i];
+            let distance = self.distance_to_end(i).unwrap_or(f64::INFINITY);
+            distance > vehicle.speed * vehicle.speed / (2.0 * vehicle.driver.braking)
+        };
+        let mut parks = (0..self.vehicles.len())
+            .map(can_park)
+            .collect::<Vec<_>>()
+            .into_iter();
+        self.vehicles.retain(|_| parks.next() == Some(true));
+        let seconds = n_steps as f64 * self.dt;
+        let lanes = (0..self.network.lanes.len())
+            .filter(|&lane| self.network.lanes[lane].is_entry && self.is_inner(lane));
+        for lane in lanes.collect::<Vec<_>>() {
+            let arrives = self
+                .rng
+                .random_bool((self.demand.arrivals * seconds).min(1.0));
+            let n = self.vehicles.len();
+            if arrives && self.is_used(lane) && self.count(AgentKind::Vehicle) < self.demand.moving
+            {
+                self.try_add(AgentKind::Vehicle, lane, 3.0);
+            }
+            if let Some(vehicle) = self.vehicles.get_mut(n) {
+                vehicle.speed = 0.0;
+                vehicle.starts = self.time + self.rng.random_range(0.0..seconds);
+            }
         }
     }
 

@@ -16,6 +16,8 @@ use crate::plan::Control;
 // Clearances and the thresholds below are chosen by hand; tests check that boxes seldom overlap.
 /// Metres behind the last conflict at which a claim ends.
 const CLEAR: f64 = 1.0;
+/// Metres that vehicles keep to the end of a yard or car park where they park.
+const INNER_GAP: f64 = 0.5;
 /// Metres of pavement beside a vehicle's way that must be free of people.
 const PERSON_CLEARANCE: f64 = 0.9;
 /// A faster vehicle in a junction is not about to stop, m/s.
@@ -62,6 +64,20 @@ impl TrafficSimulation<'_> {
         let distance = vehicle.distance_to(self.network, leg);
         let near = distance < self.decision_distance(vehicle);
         near.then_some(distance - vehicle.driver.line_gap)
+    }
+
+    /// Metres from the front to where vehicle `i` parks, if its way ends in a yard or car park that is
+    /// watched.
+    pub(super) fn distance_to_end(&self, i: usize) -> Option<f64> {
+        let vehicle = &self.vehicles[i];
+        let last = vehicle.path.len() - 1;
+        let lane = vehicle.path[last];
+        if !self.is_watched || !self.is_inner(lane) || !self.network.lanes[lane].is_exit {
+            return None;
+        }
+        let end = vehicle.distance_to(self.network, last) + self.network.lanes[lane].length();
+        let distance = end - INNER_GAP;
+        (distance < self.decision_distance(vehicle)).then_some(distance)
     }
 
     fn connector(&self, lane: LaneIdx) -> &Connector {

@@ -74,6 +74,8 @@ pub(crate) struct Vehicle {
     pub(crate) patience: f64,
     /// Stays in place, like a vehicle that has stopped in the lane to load.
     pub(crate) is_held: bool,
+    /// Stays in place until then, seconds of the simulation.
+    pub(crate) starts: f64,
 }
 
 impl Vehicle {
@@ -109,6 +111,7 @@ impl Vehicle {
             change: None,
             patience: rng.random_range(1.0..12.0),
             is_held: false,
+            starts: 0.0,
         }
     }
 
