@@ -22,7 +22,8 @@ use crate::{EvalError, LanePurpose, Monitor, RecordingError};
 pub struct Imagined {
     /// The futures.
     pub rollouts: Vec<Rollout>,
-    /// Frames that the world made, at its own rate, over all futures.
+    /// Simulated frames over all futures, in steps of the scene: a world whose own step is longer
+    /// makes several at a time.
     pub frames: usize,
     /// Wall time that the world took, opening included.
     pub elapsed: Duration,
@@ -34,7 +35,7 @@ pub struct Imagined {
 }
 
 impl Imagined {
-    /// Frames that the world made per second of wall time.
+    /// Simulated frames, in steps of the scene (0.1 s), per second of wall time, all futures together.
     pub fn frames_per_second(&self) -> f64 {
         self.frames as f64 / self.elapsed.as_secs_f64().max(1e-9)
     }
@@ -221,13 +222,12 @@ impl Session for WatchedSession<'_> {
         let began = Instant::now();
         let frames = self.session.step(ego)?;
         let stride = (self.session.dt() / self.watched.scene_dt).round().max(1.0);
-        self.watched
-            .monitor
-            .advance((stride * frames.len() as f64) as u64);
+        let n = stride as usize * frames.len();
+        self.watched.monitor.advance(n as u64);
         let samples = self.session.take_predictive_samples();
         self.watched.add(|cost| {
             cost.elapsed += began.elapsed();
-            cost.frames += frames.len();
+            cost.frames += n;
             cost.steps += 1;
             cost.samples.extend(samples);
         });
@@ -301,6 +301,8 @@ mod tests {
         let plain = imagine(&world, &scenario, 2, &config, seed, &()).unwrap();
         let probed = imagine_probed(&world, &scenario, 2, &config, seed, probe, &()).unwrap();
         assert!(plain.samples.is_empty());
+        // Two futures of ten steps of the scene, which the world makes in two of its own.
+        assert_eq!(plain.frames, 20);
         let frames = |imagined: &Imagined| -> Vec<Vec<Frame>> {
             imagined
                 .rollouts

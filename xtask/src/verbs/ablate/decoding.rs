@@ -57,8 +57,8 @@ pub(crate) enum Sweep {
     Quantization,
 }
 
-/// Frames of a rollout: 8 s, half a second apart.
-const FRAMES: f64 = 16.0;
+/// Frames of a rollout: 8 s, a tenth of a second apart.
+const FRAMES: f64 = 80.0;
 
 /// Seconds that a frame of one future takes, opening the session included.
 #[derive(Clone, Copy, Debug, Default)]
