@@ -101,8 +101,9 @@ impl<T: Serialize + DeserializeOwned + Clone> ResultStore<T> {
     /// new one.
     ///
     /// # Errors
-    /// [`ResultsError::OtherShard`] in a folder with another shard of the same evaluation, whose
-    /// results would be lost, and errors of writing.
+    /// [`ResultsError::OtherShard`] in a folder with another shard of the same evaluation and
+    /// [`ResultsError::ForeignShard`] in one with a shard of another evaluation, whose results would
+    /// be lost, and errors of writing.
     pub fn open(folder: &Path, header: &Header) -> Result<Self, EvalError> {
         let path = partial(folder);
         refuse_other_shard(folder, header)?;
@@ -212,22 +213,37 @@ fn partial(folder: &Path) -> PathBuf {
     folder.join(format!("{NAME}.partial"))
 }
 
-/// Error: the folder has another shard of the evaluation, finished or not.
+/// Error: the folder has another shard of the evaluation, or a shard of another evaluation, finished
+/// or not.
 fn refuse_other_shard(folder: &Path, header: &Header) -> Result<(), EvalError> {
     for path in [partial(folder), folder.join(NAME)] {
         let Ok(text) = fs::read_to_string(&path) else {
             continue;
         };
         let start = &text[..text.find(ENTRY).unwrap_or(text.len())];
-        let Ok(Document::<toml::Table> { evaluation, .. }) = toml::from_str(start) else {
+        let Ok(Document::<toml::Table> {
+            evaluation: Some(stored),
+            ..
+        }) = toml::from_str(start)
+        else {
             continue;
         };
-        let stored = evaluation.filter(|stored| stored.has_settings_of(header));
-        if let Some(stored) = stored.filter(|stored| stored.shard != header.shard) {
-            return Err(ResultsError::OtherShard {
+        if stored.has_settings_of(header) {
+            if stored.shard != header.shard {
+                return Err(ResultsError::OtherShard {
+                    path,
+                    stored: stored.shard,
+                    requested: header.shard,
+                }
+                .into());
+            }
+        } else if stored.shard != Shard::WHOLE {
+            // A whole evaluation is begun anew by anyone who changes a flag; a shard is one of many
+            // that are waited for.
+            return Err(ResultsError::ForeignShard {
                 path,
-                stored: stored.shard,
-                requested: header.shard,
+                stored: Box::new(stored),
+                requested: Box::new(header.clone()),
             }
             .into());
         }
@@ -437,7 +453,7 @@ mod tests {
             );
             assert!(error.contains(part), "{error}");
         };
-        fails(&["1of2"], "missing are [2]");
+        fails(&["1of2"], "expected all 2 shards, missing shard 2/2");
         let (_, half) = merge::<f64>(&[place("1of2")], MissingShards::Allow).unwrap();
         assert_eq!(
             half.iter().map(|e| e.index).collect::<Vec<_>>(),
@@ -532,10 +548,25 @@ mod tests {
         refused(2, 3);
         let (_, entries) = merge::<f64>(&[folder.path().to_owned()], MissingShards::Allow).unwrap();
         assert_eq!(entries.len(), 1);
-        // The same shard again and another split of the scenarios begin anew.
+        let other = |k, n| {
+            let settings = toml::Table::from_iter([("year".into(), 2024.into())]);
+            let header = Header {
+                settings,
+                ..header(k, n)
+            };
+            ResultStore::<f64>::open(folder.path(), &header)
+        };
+        for (error, differs) in [
+            (open(1, 2).err(), "number of shards 3 and 2"),
+            (open(1, 1).err(), "number of shards 3 and 1"),
+            (other(1, 3).err(), "year 2025 and 2024"),
+        ] {
+            let error = error.unwrap().to_string();
+            let parts = ["found shard 1/3 of another", differs, "another --out"];
+            assert!(parts.iter().all(|part| error.contains(part)), "{error}");
+        }
+        // The same shard again begins anew.
         open(1, 3).unwrap();
-        fs::remove_file(partial(folder.path())).unwrap();
-        open(1, 2).unwrap();
     }
 
     #[test]

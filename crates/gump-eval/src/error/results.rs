@@ -66,6 +66,22 @@ pub enum ResultsError {
         /// The shard that was to be written.
         requested: Shard,
     },
+    /// A folder has a shard of another evaluation than the one that is to be written to it.
+    #[error(
+        "expected a folder without other results, found shard {} of another evaluation in {} ({}): \
+         choose another --out",
+        stored.shard,
+        path.display(),
+        differences(stored, requested)
+    )]
+    ForeignShard {
+        /// The file of its results.
+        path: PathBuf,
+        /// The evaluation whose results it has.
+        stored: Box<Header>,
+        /// The evaluation that was to be written.
+        requested: Box<Header>,
+    },
     /// A scenario is in a shard twice.
     #[error("expected every scenario once, found scenario {index} twice in {}", folder.display())]
     RepeatedScenario {
@@ -104,7 +120,7 @@ pub enum ResultsError {
         folder: PathBuf,
     },
     /// Not all shards are there.
-    #[error("expected all {n} shards, missing are {missing:?}")]
+    #[error("expected all {n} shards, missing {}", listed(missing, *n))]
     MissingShards {
         /// Number of shards.
         n: usize,
@@ -164,6 +180,16 @@ pub enum ResultsError {
         /// The most frequent reason.
         reason: Option<String>,
     },
+}
+
+/// Shards by their numbers: "shard 2/3", or "shards 2/3 and 3/3".
+fn listed(missing: &[usize], n: usize) -> String {
+    let names: Vec<String> = missing.iter().map(|k| format!("{k}/{n}")).collect();
+    match names.as_slice() {
+        [one] => format!("shard {one}"),
+        [most @ .., last] => format!("shards {} and {last}", most.join(", ")),
+        [] => "none".into(),
+    }
 }
 
 /// What keeps two headers from being of one evaluation: names, and the values of both.
