@@ -47,6 +47,22 @@ pub(crate) fn legend(world: &str) -> String {
     }
 }
 
+/// Names of worlds in a legend, whose decoding may follow them in parentheses. A network beside itself
+/// decoded otherwise is `(ruled)`.
+pub(crate) fn legends(worlds: &[&str]) -> Vec<String> {
+    let apart = |world: &str| match world.strip_suffix(')').and_then(|w| w.rsplit_once(" (")) {
+        Some((world, decoding)) => (legend(world), Some(decoding.to_owned())),
+        None => (legend(world), None),
+    };
+    let all: Vec<(String, Option<String>)> = worlds.iter().map(|world| apart(world)).collect();
+    let name = |(world, decoding): &(String, Option<String>)| match decoding {
+        Some(decoding) => format!("{world} ({decoding})"),
+        None if all.iter().any(|(w, d)| w == world && d.is_some()) => format!("{world} (ruled)"),
+        None => world.clone(),
+    };
+    all.iter().map(name).collect()
+}
+
 /// Writes `STEM.svg` and `STEM.png` into the folder of the run; nothing if there is no number.
 pub(crate) fn save(run: &Run, stem: &str, bars: &Bars) -> anyhow::Result<()> {
     match bars.save(&run.path(stem)) {
@@ -74,6 +90,16 @@ mod tests {
         let span = Some((0.4, 0.7));
         assert_eq!(chart.groups[0].bars, [Some(Bar { value: 0.5, span })]);
         assert_eq!(chart.groups[1].bars, [None]);
+    }
+
+    #[test]
+    fn a_network_is_told_from_itself_without_rules() {
+        let tiny = "model:a/gump-tiny.safetensors";
+        let raw = format!("{tiny} (raw)");
+        let expected = ["gump-tiny (ruled)", "gump-tiny (raw)", "log"];
+        assert_eq!(legends(&[tiny, &raw, "log"]), expected);
+        assert_eq!(legends(&[tiny, "log"]), ["gump-tiny", "log"]);
+        assert_eq!(legends(&[&raw]), ["gump-tiny (raw)"]);
     }
 
     #[test]

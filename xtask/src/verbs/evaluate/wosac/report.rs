@@ -173,7 +173,7 @@ fn chart(intervals: &[Value], worlds: &[&str]) -> Bars {
     let lines: Vec<&Value> = intervals.iter().filter(is_likelihood).collect();
     let names = lines.iter().filter_map(|line| line["score"].as_str());
     let names = names.map(|name| name.replace('_', " ")).collect();
-    let legend = worlds.iter().map(|world| charts::legend(world)).collect();
+    let legend = charts::legends(worlds);
     let label = "realism, 0 to 1, with 95 % intervals over scenarios";
     charts::bars(label, names, legend, |row, column| {
         let (line, world) = (lines[row], worlds[column]);
