@@ -1,8 +1,11 @@
 //! Flags of a learned world's decoding.
 
+use std::path::Path;
+
 use gump_engine::{CacheMode, LightSource, Mode, Precision, Routes, SamplingConfig};
 use gump_eval::decoding::Decoding;
 use gump_eval::worlds::WorldName;
+use gump_model::relative;
 use serde::Serialize;
 
 use crate::choices::{CACHES, LIGHTS, MODES, PRECISIONS, ROUTES, one_of};
@@ -77,11 +80,78 @@ impl Sampling {
         self.draw.resolve(self.mode)
     }
 
+    /// As [`Self::resolve`], for some worlds.
+    ///
+    /// Error: as [`Self::resolve`] and [`Self::check`].
+    pub(crate) fn resolve_for(&self, worlds: &[&WorldName]) -> anyhow::Result<SamplingConfig> {
+        let config = self.resolve()?;
+        self.check(worlds)?;
+        Ok(config)
+    }
+
     /// The decoding of a world.
     ///
-    /// Error: as [`Draw::resolve`].
+    /// Error: as [`Draw::resolve`] and [`Self::check`].
     pub(crate) fn decoding(&self, world: &WorldName) -> anyhow::Result<Decoding> {
-        Ok(self.draw.decoding(self.mode)?.for_world(world))
+        let decoding = self.draw.decoding(self.mode)?;
+        self.check(&[world])?;
+        Ok(decoding.for_world(world))
+    }
+
+    /// Refuses flags that no world of a run has a use for.
+    ///
+    /// Error: [`WrongArguments`], or weights that cannot be read.
+    pub(crate) fn check(&self, worlds: &[&WorldName]) -> anyhow::Result<()> {
+        let learned = worlds.iter().filter_map(|world| match world {
+            WorldName::Model(weights) => Some(weights.as_path()),
+            _ => None,
+        });
+        let learned: Vec<&Path> = learned.collect();
+        let given = self.given();
+        let wrong = if let (true, Some((flag, _)), Some(found)) =
+            (learned.is_empty(), given.first(), worlds.first())
+        {
+            format!(
+                "{flag}: expected a learned world, model:WEIGHTS, found {found}, which decodes nothing"
+            )
+        } else if let (Some((flag, _)), Some(weights)) =
+            (given.iter().find(|(_, alone)| *alone), learned.first())
+        {
+            for weights in &learned {
+                if !relative::is_relative(weights)? {
+                    return Ok(());
+                }
+            }
+            format!(
+                "{flag}: expected weights of a sequence network, found those of a relative network, \
+                 which has no such setting: {}",
+                weights.display()
+            )
+        } else {
+            return Ok(());
+        };
+        Err(WrongArguments(wrong).into())
+    }
+
+    /// The flags of decoding that change something, and whether only a sequence network follows them.
+    fn given(&self) -> Vec<(&'static str, bool)> {
+        let draw = &self.draw;
+        let flags = [
+            ("--mode", true, self.mode != Mode::PartialAr),
+            ("--cache", true, draw.cache != CacheMode::Window),
+            ("--top-k", true, draw.top_k.is_some()),
+            ("--decay", true, draw.decay.is_some()),
+            ("--precision", false, draw.precision != Precision::F32),
+            ("--temperature", false, draw.temperature.is_some()),
+            ("--top-p", false, draw.top_p.is_some()),
+            ("--redraws", false, draw.redraws.is_some()),
+            ("--no-limits", false, draw.no_limits),
+            ("--routes", false, draw.routes != Routes::Late),
+            ("--raw", false, draw.raw),
+            ("--paper", false, draw.paper),
+        ];
+        let given = flags.into_iter().filter(|(_, _, is_given)| *is_given);
+        given.map(|(flag, alone, _)| (flag, alone)).collect()
     }
 
     /// Every decoding of a world that a table shows: for a network under rules also the network
@@ -91,7 +161,7 @@ impl Sampling {
     pub(crate) fn decodings(&self, world: &WorldName) -> anyhow::Result<Vec<Decoding>> {
         match world {
             WorldName::Model(_) => self.draw.decodings(self.mode),
-            _ => Ok(vec![self.decoding(world)?]),
+            _ => Ok(vec![self.draw.decoding(self.mode)?.for_world(world)]),
         }
     }
 }
@@ -211,6 +281,7 @@ impl Draw {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::machine;
 
     fn draw() -> Draw {
         Draw {
@@ -229,6 +300,52 @@ mod tests {
             life: false,
             lights: LightSource::Model,
         }
+    }
+
+    #[test]
+    fn flags_that_no_world_follows_are_refused() {
+        let folder = machine::repository().join("datasets/weights");
+        let model = |name: &str| WorldName::Model(folder.join(name));
+        let relative = model("gump-relative.safetensors");
+        let sequence = model("gump-tiny.safetensors");
+        let sampling = |draw: Draw| Sampling {
+            mode: Mode::PartialAr,
+            draw,
+        };
+        let wrong = |sampling: &Sampling, worlds: &[&WorldName]| {
+            let checked = sampling.check(worlds);
+            checked.map_or_else(|error| error.to_string(), |()| String::new())
+        };
+        let raw = sampling(Draw {
+            raw: true,
+            ..draw()
+        });
+        let error = wrong(&raw, &[&WorldName::Idm]);
+        assert!(
+            error.starts_with("--raw: ") && error.contains("found idm"),
+            "{error}"
+        );
+        assert_eq!(wrong(&raw, &[&WorldName::Idm, &relative]), "");
+        let decay = sampling(Draw {
+            decay: Some(0.5),
+            ..draw()
+        });
+        let error = wrong(&decay, &[&WorldName::Log, &relative]);
+        assert!(
+            error.starts_with("--decay: ") && error.contains("gump-relative"),
+            "{error}"
+        );
+        assert_eq!(wrong(&decay, &[&relative, &sequence]), "");
+        let mode = Sampling {
+            mode: Mode::FullAr,
+            ..sampling(draw())
+        };
+        assert!(wrong(&mode, &[&relative]).starts_with("--mode: "));
+        let spawn = sampling(Draw {
+            life: true,
+            ..draw()
+        });
+        assert_eq!(wrong(&spawn, &[&WorldName::Idm]), "");
     }
 
     #[test]

@@ -286,7 +286,6 @@ fn a_simulation_says_how_it_was_decoded() {
     let curved = check(&world, sampled, "raw");
     assert!(ruled != raw && raw != paper && ruled != paper);
     assert_ne!(paper, curved, "the paper's interpolation is part of it");
-    assert_eq!(check("idm", "", "-"), check("idm", " --paper", "-"));
 }
 
 #[test]

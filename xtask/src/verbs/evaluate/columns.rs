@@ -14,6 +14,7 @@ pub(super) fn columns(
     sampling: &Sampling,
 ) -> anyhow::Result<Vec<DecodedWorld>> {
     let mut columns = Vec::new();
+    sampling.check(&worlds.iter().collect::<Vec<_>>())?;
     for world in worlds {
         let decodings = sampling.decodings(world)?.into_iter();
         columns.extend(decodings.map(|decoding| DecodedWorld {

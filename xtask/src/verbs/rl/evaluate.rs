@@ -165,7 +165,8 @@ pub(super) fn load<'a>(
     sampling: &Sampling,
     live_lights: bool,
 ) -> anyhow::Result<Vec<(&'a WorldName, RlWorld)>> {
-    let (sampling, device) = (sampling.resolve()?, run.device().clone());
+    let names: Vec<&WorldName> = names.into_iter().collect();
+    let (sampling, device) = (sampling.resolve_for(&names)?, run.device().clone());
     run.phase("load", |_| {
         let load = |name| Ok((name, RlWorld::load(&device, name, &sampling, live_lights)?));
         names.into_iter().map(load).collect()
