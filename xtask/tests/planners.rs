@@ -166,6 +166,32 @@ fn doubled_and_foreign_shards_of_drives_are_refused() {
 }
 
 #[test]
+fn a_broken_file_is_not_the_fault_of_a_planner() {
+    let place = Workplace::new();
+    place.write_scenes(&["a", "b"]);
+    let bytes = fs::read(place.path("scenes.tfrecord")).unwrap();
+    fs::write(place.path("scenes.tfrecord"), &bytes[..bytes.len() - 99]).unwrap();
+    let parts = [
+        "found 1 of 2 broken, which are left out; the first, scenes.tfrecord#1: ",
+        "record 1 at byte",
+    ];
+    for (words, out) in [
+        (format!("{DRIVE} --world log --planner simple"), "closed"),
+        ("evaluate open-loop --planner simple".into(), "open"),
+    ] {
+        let words = format!("{words} --scenarios scenes.tfrecord");
+        place.fails(&words, out, &parts);
+        let text = fs::read_to_string(place.path(out).join("report.json")).unwrap();
+        let results = &serde_json::from_str::<Value>(&text).unwrap()["results"];
+        let row = &results["rows"][0];
+        assert_eq!((&row["scenarios"], &row["failed"]), (&1.into(), &0.into()));
+        assert_eq!(results["unreadable"][0]["id"], "scenes.tfrecord#1");
+    }
+    // The part that is there is no whole either.
+    place.fails("evaluate merge closed", "merged", &parts);
+}
+
+#[test]
 fn shards_of_other_scenarios_or_weights_under_the_same_names_are_refused() {
     let place = Workplace::new();
     // The network is loaded and not asked.

@@ -87,8 +87,11 @@ pub struct ScenarioDrives {
     pub log_name: String,
     /// nuPlan's type of scenario; "unknown" for other formats.
     pub scenario_type: String,
-    /// World by world, in each the planners in their order.
+    /// World by world, in each the planners in their order; none if the scenario could not be read.
     pub outcomes: Vec<DriveOutcome>,
+    /// Why the scenario could not be read, which is not for lack of a planner.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub unreadable: Option<String>,
 }
 
 /// The outcome of one drive.
@@ -135,6 +138,12 @@ pub trait PlannerFactory: Sync {
     fn is_parallel(&self) -> bool {
         true
     }
+}
+
+/// Why a scenario cannot be read; `None` if it can, whether or not it can be driven through.
+fn unreadable(named: &Named) -> Option<String> {
+    let error = named.case.as_ref().err()?;
+    matches!(error.cause(), EvalError::Data(_)).then(|| error.to_string())
 }
 
 /// A planner to evaluate.
@@ -293,7 +302,8 @@ impl ClosedLoopEvaluation<'_> {
     /// The outcomes of every planner in every world in the scenario at position `index`.
     ///
     /// # Errors
-    /// An error of the visitor. A failed drive is an outcome.
+    /// An error of the visitor. A failed drive is an outcome, a scenario that cannot be read is
+    /// [`ScenarioDrives::unreadable`].
     pub fn through(
         &self,
         index: usize,
@@ -301,6 +311,14 @@ impl ClosedLoopEvaluation<'_> {
         monitor: &dyn Monitor,
         visit: DriveVisitor<'_>,
     ) -> Result<ScenarioDrives, EvalError> {
+        if let Some(why) = unreadable(&named) {
+            return Ok(ScenarioDrives {
+                log_name: named.log_name,
+                scenario_type: named.scenario_type,
+                outcomes: Vec::new(),
+                unreadable: Some(why),
+            });
+        }
         let seed = self.seed.fork(index as u64);
         let planners = self.row_planners();
         let mut outcomes = Vec::new();
@@ -338,6 +356,7 @@ impl ClosedLoopEvaluation<'_> {
             log_name: named.log_name,
             scenario_type: named.scenario_type,
             outcomes,
+            unreadable: None,
         })
     }
 

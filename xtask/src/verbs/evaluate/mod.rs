@@ -18,7 +18,11 @@ pub(crate) mod reactions;
 mod warnings;
 pub(crate) mod wosac;
 
+use serde_json::json;
+
 pub(crate) use closed_loop::Driving;
+
+use crate::run::Run;
 
 /// The benchmarks.
 #[derive(Debug, clap::Subcommand)]
@@ -39,6 +43,27 @@ pub(crate) enum Verb {
     OpenLoop(open_loop::Args),
     /// Merge the shards of one evaluation
     Merge(merge::Args),
+}
+
+/// Fails, after all else is reported, if scenarios could not be read; `unreadable` are their names
+/// and why.
+fn all_readable(
+    run: &mut Run,
+    unreadable: &[(&str, String)],
+    scenarios: usize,
+) -> anyhow::Result<()> {
+    let Some((id, why)) = unreadable.first() else {
+        return Ok(());
+    };
+    let rows = unreadable
+        .iter()
+        .map(|(id, error)| json!({ "id": id, "error": error }));
+    run.result("unreadable", rows.collect::<Vec<_>>())?;
+    anyhow::bail!(
+        "expected scenarios that can be read, found {} of {scenarios} broken, which are left out; \
+         the first, {id}: {why}",
+        unreadable.len()
+    )
 }
 
 /// Fails with the first error if no scenario of a report went through.

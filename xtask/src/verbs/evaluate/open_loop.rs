@@ -2,6 +2,7 @@
 
 use std::num::NonZeroUsize;
 
+use gump_eval::EvalError;
 use gump_eval::benchmarks::{ScenarioSet, ScenarioSetName};
 use gump_eval::open_loop::{OpenLoopOutcome, numbers, plan};
 use gump_eval::planners::{PlannerName, PlanningWorld};
@@ -12,7 +13,7 @@ use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::closed_loop::mean;
-use super::warnings::{self, failed_drives, missing_intervals};
+use super::warnings::{self, failed_drives, few_scenarios, missing_intervals};
 use crate::cli::WrongArguments;
 use crate::planners::{ImaginationArgs, planner};
 use crate::run::{Common, Run};
@@ -54,7 +55,8 @@ impl Args {
             );
             return Err(WrongArguments(wrong).into());
         }
-        let sampling = self.sampling.resolve()?;
+        let sampling = self.sampling.resolve_for(&[&self.world])?;
+        self.thinking.config()?;
         let surroundings = run.phase("load", |run| {
             Ok(PlanningWorld::load_imagination(
                 run.device(),
@@ -65,9 +67,17 @@ impl Args {
         let found = benchmark::find(run, &self.scenarios)?;
         run.result("set", &found.name)?;
         let (mut rows, mut scenarios) = (Vec::new(), Vec::new());
+        let (mut unreadable, mut read) = (Vec::new(), 0);
+        let ids = run.phase("find", |_| Ok(recordings::ids(&found.paths, self.limit())?))?;
+        let total = ids.len();
         for &planner in &self.planner {
-            let outcomes =
-                run.phase("plan", |run| self.plan(run, &found, planner, &surroundings))?;
+            let outcomes = run.phase("plan", |run| {
+                self.plan(run, &found, total, planner, &surroundings)
+            })?;
+            read = outcomes.len();
+            let (broken, outcomes): (Vec<_>, Vec<_>) = outcomes.into_iter().partition(is_broken);
+            // The same ones for every planner.
+            unreadable = broken;
             rows.push(row(planner.name(), &outcomes, run));
             scenarios.extend(
                 outcomes
@@ -86,22 +96,34 @@ impl Args {
         charts::save(run, "scores", &chart)?;
         let mut sentences = Vec::from_iter(failed_drives(&rows));
         sentences.extend(missing_intervals(&rows));
+        if let Some(note) = few_scenarios(&rows) {
+            run.print(&note);
+        }
         run.result("rows", rows)?;
         warnings::report(run, &sentences)?;
         run.result("scenarios", &scenarios)?;
+        let unreadable = unreadable.iter().filter_map(|outcome| {
+            let why = outcome.compared.as_ref().err()?.to_string();
+            Some((outcome.id.as_str(), why))
+        });
+        super::all_readable(run, &unreadable.collect::<Vec<_>>(), read)?;
         super::any_succeeded(&scenarios)
+    }
+
+    fn limit(&self) -> usize {
+        self.limit.map_or(usize::MAX, NonZeroUsize::get)
     }
 
     fn plan(
         &self,
         run: &Run,
         found: &ScenarioSet,
+        total: usize,
         planner: PlannerName,
         surroundings: &PlanningWorld,
     ) -> anyhow::Result<Vec<OpenLoopOutcome>> {
-        let limit = self.limit.map(NonZeroUsize::get);
-        let cases = recordings::open_all(&found.paths)?.take(limit.unwrap_or(usize::MAX));
-        let progress = run.progress(planner.name(), limit.unwrap_or(0) as u64, "scenarios");
+        let cases = recordings::open_all(&found.paths)?.take(self.limit());
+        let progress = run.progress(planner.name(), total as u64, "scenarios");
         let (imagination, config) = (surroundings.imagination(), self.thinking.config()?);
         Ok(plan(
             cases,
@@ -112,6 +134,12 @@ impl Args {
             &progress,
         )?)
     }
+}
+
+/// Whether the scenario could not be read.
+fn is_broken(outcome: &OpenLoopOutcome) -> bool {
+    let error = outcome.compared.as_ref().err();
+    error.is_some_and(|error| matches!(error.cause(), EvalError::Data(_)))
 }
 
 /// One planner in one scenario.

@@ -16,20 +16,32 @@ use crate::table;
 /// somebody looks at.
 const N_SCENES_NAMED: usize = 5;
 
-/// The table of one world as text of so many columns: percent, without what is the same in every row.
+/// Difference of two scores, 0 to 1, that is not worth a look: a table shows less of it.
+const LEAST_DIFFERENCE: f64 = 1e-6;
+
+/// The tables of one world as text of so many columns, without what is the same in every row: scores
+/// in percent, then what is no share.
 pub(super) fn table_of(world: &WorldName, rows: &[Value], width: usize) -> String {
     let percent = |value: &Value| value.as_f64().map(|x| (x * 1e4).round() / 100.0);
-    let shown = rows.iter().map(|row| {
-        let mut shown = json!({ "planner": row["planner"], "failed": row["failed"] });
+    let scores = rows.iter().map(|row| {
+        let mut shown = json!({ "planner": row["planner"] });
         let names = COLUMNS.iter().map(|(name, _)| *name);
         for name in ["score", "low", "high"].into_iter().chain(names) {
             shown[name] = json!(percent(&row[name]));
         }
-        shown["ms"] = row["milliseconds_per_step"].clone();
         shown
     });
-    let shown: Vec<Value> = shown.collect();
-    table::text(&json!({ format!("among {world}, %"): shown }), width)
+    let counts = rows.iter().map(|row| {
+        json!({
+            "planner": row["planner"],
+            "scenarios": row["scenarios"],
+            "failed": row["failed"],
+            "milliseconds_per_step": row["milliseconds_per_step"],
+        })
+    });
+    let (scores, counts): (Vec<Value>, Vec<Value>) = (scores.collect(), counts.collect());
+    let tables = json!({ format!("among {world}, %"): scores, format!("among {world}"): counts });
+    table::text(&tables, width)
 }
 
 /// Compares all pairs of planners in every world and warns where a pair changes places. Further
@@ -173,8 +185,8 @@ impl<'a> Pair<'a> {
         let mut losses = wins.clone();
         wins.sort_by(|a, b| difference(b).total_cmp(&difference(a)));
         losses.sort_by(|a, b| difference(a).total_cmp(&difference(b)));
-        wins.retain(|scene| difference(scene) > 0.0);
-        losses.retain(|scene| difference(scene) < 0.0);
+        wins.retain(|scene| difference(scene) > LEAST_DIFFERENCE);
+        losses.retain(|scene| difference(scene) < -LEAST_DIFFERENCE);
         let named = [wins, losses].into_iter().flat_map(|side| {
             let rows = side.into_iter().take(N_SCENES_NAMED);
             rows.map(|scene| {
@@ -226,6 +238,7 @@ mod tests {
                 log_name: "log".into(),
                 scenario_type: "unknown".into(),
                 outcomes: Vec::new(),
+                unreadable: None,
             },
         }
     }
@@ -258,10 +271,29 @@ mod tests {
             (scene(3), 0.2, 0.1),
             (scene(1), 0.2, 0.1),
             (scene(7), 0.5, 0.5),
+            (scene(8), 0.5, 0.5 + 1e-9),
+            (scene(9), 0.5 + 1e-9, 0.5),
         ];
         let rows = pair(&equal).extremes();
         let ids: Vec<&str> = rows.iter().filter_map(|row| row["id"].as_str()).collect();
         assert_eq!(ids, ["s3", "s1"]);
+    }
+
+    #[test]
+    fn what_is_no_share_is_not_among_the_percent() {
+        let row = json!({ "planner": "idm", "scenarios": 3, "failed": 1, "score": 0.5,
+                          "milliseconds_per_step": 7.0 });
+        let text = table_of(&WorldName::Idm, &[row], usize::MAX);
+        let (scores, counts) = text.split_once("\namong idm\n").unwrap();
+        assert!(
+            scores.contains("among idm, %") && scores.contains("50.00"),
+            "{text}"
+        );
+        assert!(
+            !scores.contains("failed") && counts.contains("failed"),
+            "{text}"
+        );
+        assert!(counts.contains("milliseconds_per_step"), "{text}");
     }
 
     #[test]

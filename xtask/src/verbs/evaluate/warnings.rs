@@ -41,6 +41,20 @@ pub(super) fn missing_intervals(rows: &[Value]) -> Option<String> {
     })
 }
 
+/// Scenarios below which an interval says little: resampled, they are mostly the same few. Chosen by
+/// hand.
+const FEW: u64 = 10;
+
+/// Notes that the intervals of `rows` are over few scenarios, if they are.
+pub(super) fn few_scenarios(rows: &[Value]) -> Option<String> {
+    let driven = |row: &Value| Some(row["scenarios"].as_u64()? - row["failed"].as_u64()?);
+    let spanned = rows.iter().filter(|row| row["low"].is_number());
+    let fewest = spanned.filter_map(driven).min().filter(|n| *n < FEW)?;
+    Some(format!(
+        "note: intervals over fewer than {FEW} scenarios mean little, found {fewest}"
+    ))
+}
+
 /// The planner of a row, and its world in tables of several.
 fn who(row: &Value) -> String {
     let planner = row["planner"].as_str().unwrap_or_default();
@@ -83,6 +97,12 @@ mod tests {
         let nothing = json!({ "planner": "c", "scenarios": 5, "failed": 5, "score": null });
         let failed = failed_drives(std::slice::from_ref(&nothing)).unwrap();
         assert!(failed.ends_with("hard: c in 5 of 5"), "{failed}");
+        assert_eq!(
+            few_scenarios(&all_well).unwrap().matches("found 5").count(),
+            1
+        );
+        let many = json!({ "scenarios": 12, "failed": 2, "low": 0.5 });
+        assert_eq!(few_scenarios(&[many]), None);
         // No score, no interval to miss.
         assert_eq!(missing_intervals(&[nothing]), None);
     }

@@ -130,7 +130,8 @@ impl Args {
         }
         self.planner.iter().try_for_each(Chosen::check)?;
         let thinking = self.thinking.config()?;
-        let sampling = self.sampling.resolve()?;
+        let worlds = self.world.iter().chain([self.imagination()]);
+        let sampling = self.sampling.resolve_for(&worlds.collect::<Vec<_>>())?;
         let found = benchmark::find(run, &self.scenarios)?;
         let imagined = run.phase("load", |run| {
             let name = self.imagination();
@@ -148,7 +149,8 @@ impl Args {
             let worlds = self.world.iter().map(load);
             worlds.collect::<anyhow::Result<Vec<_>>>()
         })?;
-        let settings = run.phase("find", |run| self.settings(run, &found))?;
+        let ids = run.phase("find", |_| Ok(recordings::ids(&found.paths, self.limit())?))?;
+        let settings = self.settings(run, &found, &ids)?;
         let header = Header {
             benchmark: BENCHMARK.into(),
             shard: self.shard,
@@ -167,7 +169,9 @@ impl Args {
         let store: ResultStore<ScenarioDrives> = ResultStore::open(run.out(), &header)?;
         let entries = run.phase("drive", |run| {
             let cases = recordings::open_all(&found.paths)?.take(self.limit());
-            let progress = run.progress("driving", 0, "scenarios");
+            let is_left = |index: &usize| store.is_wanted(*index);
+            let left = (0..ids.len()).filter(is_left).count();
+            let progress = run.progress("driving", left as u64, "scenarios");
             let visit = |drive: VisitedDrive<'_>| match drive.index < self.films {
                 true => film(run, &drive),
                 false => Ok(()),
@@ -195,8 +199,12 @@ impl Args {
         self.limit.map_or(usize::MAX, NonZeroUsize::get)
     }
 
-    fn settings(&self, run: &Run, found: &ScenarioSet) -> anyhow::Result<ClosedLoopSettings> {
-        let ids = recordings::ids(&found.paths, self.limit())?;
+    fn settings(
+        &self,
+        run: &Run,
+        found: &ScenarioSet,
+        ids: &[String],
+    ) -> anyhow::Result<ClosedLoopSettings> {
         let worlds = self.world.iter().chain([self.imagination()]);
         Ok(ClosedLoopSettings {
             scenarios: found.name.clone(),
@@ -208,7 +216,7 @@ impl Args {
             imagining: serde_json::to_string(&self.thinking)?,
             sampling: serde_json::to_string(&self.sampling)?,
             seed: run.seed().0.to_string(),
-            checksums: checksums(&ids, worlds)?,
+            checksums: checksums(ids, worlds)?,
         })
     }
 }

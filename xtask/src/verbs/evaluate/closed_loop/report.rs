@@ -13,8 +13,8 @@ use gump_viz::Bars;
 use serde_json::{Value, json};
 
 use crate::run::Run;
-use crate::verbs::evaluate::warnings::{self, failed_drives, missing_intervals};
-use crate::verbs::evaluate::{any_succeeded, ranking};
+use crate::verbs::evaluate::warnings::{self, failed_drives, few_scenarios, missing_intervals};
+use crate::verbs::evaluate::{all_readable, any_succeeded, ranking};
 use crate::{charts, tables};
 
 /// Columns of the table, by nuPlan's names of the metrics.
@@ -101,10 +101,18 @@ pub(super) fn report(
     charts::save(run, "scores", &chart(&rows, &settings.worlds))?;
     let mut sentences = Vec::from_iter(failed_drives(&rows));
     sentences.extend(missing_intervals(&rows));
+    if let Some(note) = few_scenarios(&rows) {
+        run.print(&note);
+    }
     run.result("rows", rows)?;
     sentences.extend(ranking::report(run, &worlds)?);
     warnings::report(run, &sentences)?;
     run.result("scenarios", &scenarios)?;
+    let unreadable = entries.iter().filter_map(|entry| {
+        let why = entry.scores.unreadable.clone()?;
+        Some((entry.id.as_str(), why))
+    });
+    all_readable(run, &unreadable.collect::<Vec<_>>(), entries.len())?;
     any_succeeded(&scenarios)
 }
 
