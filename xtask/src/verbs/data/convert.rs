@@ -7,7 +7,8 @@ use std::time::Instant;
 
 use anyhow::Context as _;
 use gump_data::{
-    Converted, INCOMPLETE, OutputFormat, ReadOptions, convert, groups, list_files, list_unfinished,
+    Converted, DataError, INCOMPLETE, OutputFormat, ReadOptions, convert, groups, list_files,
+    list_unfinished,
 };
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -36,7 +37,7 @@ pub(crate) struct Args {
     /// Waymo, nuPlan, SUMO and the cache stay as they are
     #[arg(long)]
     smooth: bool,
-    /// Exit status 1 if anything could not be converted
+    /// Exit status 1 if anything could not be converted, also if no file is damaged
     #[arg(long)]
     strict: bool,
     #[command(flatten)]
@@ -63,6 +64,9 @@ struct Group {
     files: Vec<String>,
     /// Sentences about what could not be converted.
     refused: Vec<String>,
+    /// Those of them about files that are damaged, so that scenarios are missing.
+    #[serde(default)]
+    damaged: Vec<String>,
     skipped: BTreeMap<String, usize>,
     dropped: BTreeMap<String, usize>,
     inferred: BTreeMap<String, usize>,
@@ -128,7 +132,10 @@ impl Args {
             );
         }
         converted?;
-        std::fs::remove_file(&mark).with_context(|| format!("cannot remove {}", mark.display()))?;
+        if all.damaged.is_empty() || all.scenarios == 0 {
+            let removed = std::fs::remove_file(&mark);
+            removed.with_context(|| format!("cannot remove {}", mark.display()))?;
+        }
         for problem in all.refused.iter().take(MOST_PRINTED) {
             run.print(&format!("refused: {problem}"));
         }
@@ -136,6 +143,20 @@ impl Args {
             // An error of the path as a whole says more than a count.
             gump_data::open(&self.from).map(drop)?;
             anyhow::bail!("expected scenarios, none could be converted");
+        }
+        if let Some(first) = all.damaged.first() {
+            anyhow::bail!(
+                "expected whole files, found damage at {} {}, the first: {first}; the rest is \
+                 converted, and {} says that scenarios are missing: convert mended files into \
+                 another --to, or remove it to use the rest",
+                all.damaged.len(),
+                if all.damaged.len() == 1 {
+                    "place"
+                } else {
+                    "places"
+                },
+                mark.display()
+            );
         }
         anyhow::ensure!(
             !self.strict || all.refused.is_empty(),
@@ -227,6 +248,17 @@ impl Args {
 /// Number of refused records printed on the terminal; the report has all. Chosen by hand.
 const MOST_PRINTED: usize = 10;
 
+/// Whether a file is damaged, rather than a sound record not usable.
+fn is_damage(error: &DataError) -> bool {
+    !matches!(
+        error,
+        DataError::Scenario { .. }
+            | DataError::Field { .. }
+            | DataError::Proto { .. }
+            | DataError::Unwritable { .. }
+    )
+}
+
 fn lock(ledger: &Mutex<Conversion>) -> std::sync::MutexGuard<'_, Conversion> {
     ledger
         .lock()
@@ -240,6 +272,7 @@ impl Group {
             pairs.map(|(&name, &n)| (name.to_owned(), n)).collect()
         };
         let names = converted.files.iter().filter_map(|file| file.file_name());
+        let damaged = converted.refused.iter().filter(|error| is_damage(error));
         Self {
             scenarios: converted.scenarios,
             bytes: converted.bytes,
@@ -247,6 +280,7 @@ impl Group {
                 .map(|name| name.to_string_lossy().into_owned())
                 .collect(),
             refused: converted.refused.iter().map(ToString::to_string).collect(),
+            damaged: damaged.map(ToString::to_string).collect(),
             skipped: named(&converted.skipped),
             dropped: named(&converted.report.dropped),
             inferred: named(&converted.report.inferred),
@@ -259,6 +293,7 @@ impl Group {
             sum.bytes += group.bytes;
             sum.files.extend(group.files);
             sum.refused.extend(group.refused);
+            sum.damaged.extend(group.damaged);
             for (to, from) in [
                 (&mut sum.skipped, group.skipped),
                 (&mut sum.dropped, group.dropped),
