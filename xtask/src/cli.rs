@@ -3,11 +3,13 @@
 //! The words are a contract with the scripts of users. A verb is offered once it works, not before.
 
 use std::ffi::OsString;
+use std::io;
 use std::process::ExitCode;
 
 use clap::{ArgMatches, Command, CommandFactory, FromArgMatches, Parser, Subcommand};
 use gump_data::DataError;
 use gump_eval::EvalError;
+use gump_model::ModelError;
 use gump_train::TrainError;
 use serde::Serialize;
 
@@ -179,25 +181,51 @@ pub(crate) fn explain(error: &anyhow::Error) -> ExitCode {
             ExitCode::from(2)
         };
     }
-    print_error(&format!("error: {error:#}"));
+    print_error(&format!("error: {}", sentence(error)));
     ExitCode::from(match error {
         // As shells report a program that a signal ended: 128 plus the signal's number.
         _ if run::interrupted() => 130,
-        error if error.is::<WrongArguments>() || names_nothing(error) => 2,
-        error if error.downcast_ref().is_some_and(EvalError::is_argument) => 2,
-        error if matches!(error.downcast_ref(), Some(TrainError::OtherData { .. })) => 2,
+        error if is_about_arguments(error) => 2,
         _ => 1,
     })
 }
 
-/// True if what was read is sound and the name of a scenario in it is not.
+/// An error and what caused it as one sentence. Causes that many errors quote are there once.
+pub(crate) fn sentence(error: &anyhow::Error) -> String {
+    let mut sentence = String::new();
+    for cause in error.chain().map(ToString::to_string) {
+        if !sentence.contains(&cause) {
+            let separator = if sentence.is_empty() { "" } else { ": " };
+            sentence = format!("{sentence}{separator}{cause}");
+        }
+    }
+    sentence
+}
+
+/// Whether the arguments are wrong, rather than the work failed.
+pub(crate) fn is_about_arguments(error: &anyhow::Error) -> bool {
+    error.is::<WrongArguments>()
+        || names_nothing(error)
+        || error.downcast_ref().is_some_and(EvalError::is_argument)
+        || matches!(error.downcast_ref(), Some(TrainError::OtherData { .. }))
+}
+
+/// True if there is no file of the name, or no scenario of the name in it.
 fn names_nothing(error: &anyhow::Error) -> bool {
-    let mut causes = error.chain().filter_map(|cause| cause.downcast_ref());
-    causes.any(|cause: &DataError| {
-        matches!(
-            cause,
-            DataError::NoSuchScenario { .. } | DataError::SeveralFiles { .. }
-        )
+    let is_missing = |cause: &io::Error| cause.kind() == io::ErrorKind::NotFound;
+    error.chain().any(|cause| {
+        let data = cause.downcast_ref().is_some_and(|cause: &DataError| {
+            matches!(
+                cause,
+                DataError::NoSuchScenario { .. }
+                    | DataError::SeveralFiles { .. }
+                    | DataError::Missing { .. }
+            )
+        });
+        let model = cause.downcast_ref().is_some_and(
+            |cause: &ModelError| matches!(cause, ModelError::Io { cause, .. } if is_missing(cause)),
+        );
+        data || model || cause.downcast_ref().is_some_and(is_missing)
     })
 }
 
@@ -208,6 +236,28 @@ mod tests {
     #[test]
     fn the_command_line_is_consistent() {
         command().debug_assert();
+    }
+
+    #[test]
+    fn a_sentence_says_everything_once() {
+        let inner = anyhow::anyhow!("no such file");
+        let error = inner.context("cannot open: no such file").context("a.txt");
+        assert_eq!(sentence(&error), "a.txt: cannot open: no such file");
+        assert_eq!(sentence(&anyhow::anyhow!("late")), "late");
+    }
+
+    #[test]
+    fn what_is_not_there_is_a_wrong_argument() {
+        use anyhow::Context as _;
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("none");
+        let read = std::fs::read(&path).context("cannot read the file");
+        assert!(is_about_arguments(&read.unwrap_err()));
+        let weights = gump_model::relative::is_relative(&path).unwrap_err();
+        assert!(is_about_arguments(&weights.into()));
+        let data = gump_data::open(&path).err().unwrap();
+        assert!(is_about_arguments(&data.into()));
+        assert!(!is_about_arguments(&anyhow::anyhow!("the disk is full")));
     }
 
     #[test]

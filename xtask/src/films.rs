@@ -82,6 +82,7 @@ impl FilmArgs {
         scenario: &Scenario,
         futures: &[(&str, &Rollout)],
     ) -> anyhow::Result<()> {
+        let _waiting = run.wait("writing the film");
         let film = self.film(scenario, futures)?;
         for video in &self.video {
             film.save(&video.path(run))?;

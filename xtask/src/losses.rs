@@ -119,6 +119,11 @@ impl Losses {
         self.last.as_ref()
     }
 
+    /// Number of steps.
+    pub(crate) fn steps(&self) -> usize {
+        self.rows.len()
+    }
+
     /// Mean total loss of the first `n` steps.
     pub(crate) fn mean_of_first(&self, n: usize) -> Option<f64> {
         mean(self.rows.iter().take(n))

@@ -1,5 +1,6 @@
 //! The machine that the work ran on, and the memory that it took.
 
+use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -26,11 +27,10 @@ pub(crate) struct Machine {
 impl Machine {
     /// Asks the system.
     pub(crate) fn here(device: &str) -> Self {
-        let kib = field("/proc/meminfo", "MemTotal").and_then(|text| kibibytes(&text));
         Self {
             cpu: field("/proc/cpuinfo", "model name").unwrap_or_else(|| "unknown".into()),
             cores: cores(),
-            memory_gb: kib.map(|kib| (kib * 1024.0 / 1e8).round() / 10.0),
+            memory_gb: memory_bytes().map(|bytes| (bytes / 1e8).round() / 10.0),
             device: device.into(),
             kernel: Choice::current().clone(),
             system: format!("{} {}", std::env::consts::OS, std::env::consts::ARCH),
@@ -41,6 +41,26 @@ impl Machine {
 /// Threads the system grants this process, at least 1.
 pub(crate) fn cores() -> usize {
     std::thread::available_parallelism().map_or(1, std::num::NonZero::get)
+}
+
+/// Main memory, bytes; `None` where the system does not report it.
+pub(crate) fn memory_bytes() -> Option<f64> {
+    let kib = kibibytes(&field("/proc/meminfo", "MemTotal")?)?;
+    Some(kib * 1024.0)
+}
+
+/// Columns of the terminal; `None` where the system does not report them.
+pub(crate) fn terminal_columns() -> Option<usize> {
+    let terminal = File::open("/dev/tty").ok()?;
+    let output = Command::new("stty").arg("size").stdin(terminal).output();
+    let output = output.ok().filter(|output| output.status.success())?;
+    second_number(&String::from_utf8(output.stdout).ok()?)
+}
+
+/// The columns in "ROWS COLUMNS"; 0 stands for an unknown number.
+fn second_number(text: &str) -> Option<usize> {
+    let columns = text.split_whitespace().nth(1)?.parse().ok()?;
+    (columns > 0).then_some(columns)
 }
 
 /// Peak main memory of this process, MB; `None` where the system does not report it.
@@ -116,6 +136,13 @@ mod tests {
         assert!(peak_rss_mb().unwrap() > 0.5);
         assert!((0.0..1e6).contains(&cpu_seconds().unwrap()));
         assert!(Machine::here("cpu").memory_gb.unwrap() > 0.1);
+    }
+
+    #[test]
+    fn columns_are_the_second_number() {
+        assert_eq!(second_number("50 200\n"), Some(200));
+        assert_eq!(second_number("0 0\n"), None);
+        assert_eq!(second_number("size?"), None);
     }
 
     #[test]

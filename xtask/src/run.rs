@@ -1,6 +1,6 @@
 //! One run of a verb: its output folder, seed, threads, phases and results.
 
-use std::io::Write as _;
+use std::io::{IsTerminal as _, Write as _};
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -12,7 +12,7 @@ use gump_kernels::{Choice, Kernel};
 use gump_scene::Seed;
 use serde::Serialize;
 
-use crate::cli::WrongArguments;
+use crate::cli::{self, WrongArguments};
 use crate::machine;
 use crate::progress::Progress;
 use crate::report::Report;
@@ -42,7 +42,8 @@ pub(crate) struct Common {
     /// Print only errors, no progress and no table
     #[arg(long)]
     quiet: bool,
-    /// Print tables in full width; report.json always has them in full
+    /// Print tables in full width rather than that of the terminal; report.json always has them in
+    /// full
     #[arg(long)]
     #[serde(skip)]
     wide: bool,
@@ -109,8 +110,23 @@ fn quietly<T, E: std::fmt::Display>(open: impl FnOnce() -> Result<T, E>) -> Resu
     Err(first.unwrap_or("it does not say why").to_owned())
 }
 
-/// Columns of a terminal that tables fit into: a usual wide one. Chosen by hand.
+/// Columns that tables fit into where there is no terminal: a usual wide one. Chosen by hand.
 const WIDTH: usize = 120;
+/// Columns that tables take at least: fewer hold no table. Chosen by hand.
+const LEAST_WIDTH: usize = 40;
+
+/// Columns that tables may take.
+fn columns(wide: bool) -> usize {
+    let terminal = || {
+        let is_terminal = std::io::stdout().is_terminal();
+        let columns = is_terminal.then(machine::terminal_columns).flatten();
+        columns.map_or(WIDTH, |columns| columns.max(LEAST_WIDTH))
+    };
+    if wide { usize::MAX } else { terminal() }
+}
+
+/// The most threads that can be meant: a processor has fewer cores.
+const MOST_THREADS: usize = 1024;
 
 /// A run in progress.
 pub(crate) struct Run {
@@ -140,6 +156,13 @@ impl Run {
             let forced = Kernel::named(name).and_then(Choice::force);
             forced.map_err(|why| WrongArguments(format!("--kernel: {why}")))?;
         }
+        if let Some(found) = common
+            .threads
+            .filter(|threads| threads.get() > MOST_THREADS)
+        {
+            let wrong = format!("--threads: expected at most {MOST_THREADS}, found {found}");
+            return Err(WrongArguments(wrong).into());
+        }
         let device = common.device.open()?;
         let out = match &common.out {
             Some(out) => out.clone(),
@@ -152,7 +175,7 @@ impl Run {
         Ok(Self {
             seed: Seed(seed),
             quiet: common.quiet,
-            width: if common.wide { usize::MAX } else { WIDTH },
+            width: columns(common.wide),
             threads: common
                 .threads
                 .map_or_else(machine::cores, NonZeroUsize::get),
@@ -182,9 +205,14 @@ impl Run {
         }
         done = done.and_then(|()| self.report.write_tables(&self.out));
         self.report.add_seconds("total", self.began.elapsed());
-        self.report.error = done.as_ref().err().map(|error| format!("{error:#}"));
+        self.report.error = done.as_ref().err().map(cli::sentence);
         let path = self.out.join("report.json");
-        let written = self.report.write(&path);
+        // Wrong arguments change nothing, the report of an earlier run included.
+        let is_refused = done.as_ref().is_err_and(cli::is_about_arguments);
+        let written = match is_refused && path.exists() {
+            true => Ok(()),
+            false => self.report.write(&path),
+        };
         let has_something_to_show = done.is_ok() || self.report.has_something_to_show();
         if !self.quiet && has_something_to_show {
             print_line(&format!(
@@ -211,6 +239,11 @@ impl Run {
     /// Begins a progress bar of `total` units.
     pub(crate) fn progress(&self, what: &str, total: u64, unit: &'static str) -> Progress {
         Progress::begin(self.quiet, what, total, unit)
+    }
+
+    /// Begins to wait for work whose progress is not known.
+    pub(crate) fn wait(&self, what: &str) -> Progress {
+        Progress::wait(self.quiet, what)
     }
 
     /// Follows work that shows progress in parts only.
@@ -296,6 +329,15 @@ impl Run {
     pub(crate) fn seed(&self) -> Seed {
         self.seed
     }
+}
+
+/// Why a run that begins anew is refused in a folder with the file of an earlier one.
+pub(crate) fn would_replace(file: &Path) -> String {
+    format!(
+        "--out: expected a folder without a run, found {}, which a new run would replace: continue \
+         that run with --resume, or choose another --out",
+        file.display()
+    )
 }
 
 /// Prints a line; a closed standard output is not an error.

@@ -2,7 +2,6 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::Context as _;
 use gump_eval::worlds::WorldName;
 
 use crate::installed::home;
@@ -51,14 +50,13 @@ pub(crate) fn sequence_world() -> WorldName {
 /// Error: they are not.
 pub(crate) fn check_weights() -> anyhow::Result<()> {
     for path in [weights(), traffic()] {
-        std::fs::metadata(&path).map(drop).with_context(|| {
-            format!(
-                "expected the shipped weights at {}; \
-                 GUMP_HOME names the folder that holds datasets, and \
-                 `cargo xtask train --data datasets/mini` makes others",
-                path.display()
-            )
-        })?;
+        anyhow::ensure!(
+            path.is_file(),
+            "expected the shipped weights at {}; \
+             GUMP_HOME names the folder that holds datasets, and \
+             `cargo xtask train --data datasets/mini` makes others",
+            path.display()
+        );
     }
     Ok(())
 }

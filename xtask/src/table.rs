@@ -19,15 +19,18 @@ pub(crate) fn text(results: &Value, width: usize) -> String {
     let mut text = aligned(&pairs);
     for (name, rows) in tables {
         let shown = rows.len().min(MAX_ROWS + 1);
-        let (fitted, n_hidden) = fitted(rows[..shown].to_vec(), width);
+        let (fitted, hidden) = fitted(rows[..shown].to_vec(), width);
         text.push_str(&format!("\n{name}\n{}", aligned(&fitted)));
         if rows.len() > shown {
             text.push_str(&format!("... and {} more\n", rows.len() - shown));
         }
-        if n_hidden > 0 {
-            text.push_str(&format!(
-                "... and {n_hidden} more columns: in report.json, and here with --wide\n"
-            ));
+        if !hidden.is_empty() {
+            let note = format!(
+                "... and {} more columns, in report.json and here with --wide: {}",
+                hidden.len(),
+                hidden.join(", ")
+            );
+            text.push_str(&wrapped(&note, width));
         }
     }
     text
@@ -125,14 +128,32 @@ pub(crate) fn decimal(x: f64) -> String {
     }
 }
 
-/// The table in a form that fits, and how many of its columns or rows had to go for that.
-fn fitted(rows: Rows, width: usize) -> (Rows, usize) {
+/// Text in lines of at most `width` columns, where its words allow that.
+fn wrapped(text: &str, width: usize) -> String {
+    let (mut wrapped, mut column) = (String::new(), 0);
+    for word in text.split(' ') {
+        let n = word.chars().count();
+        if column > 0 && column + 1 + n > width {
+            wrapped.push_str("\n... ");
+            column = 4 + n;
+        } else {
+            wrapped.push_str(if column > 0 { " " } else { "" });
+            column += usize::from(column > 0) + n;
+        }
+        wrapped.push_str(word);
+    }
+    wrapped.push('\n');
+    wrapped
+}
+
+/// The table in a form that fits, and the names of its columns or rows that had to go for that.
+fn fitted(rows: Rows, width: usize) -> (Rows, Vec<String>) {
     if width_of(&rows) <= width {
-        return (rows, 0);
+        return (rows, Vec::new());
     }
     let joined = with_intervals(rows);
     if width_of(&joined) <= width {
-        return (joined, 0);
+        return (joined, Vec::new());
     }
     let turned = transposed(&joined);
     // A table with more worlds than numbers is no better on its side.
@@ -143,15 +164,15 @@ fn fitted(rows: Rows, width: usize) -> (Rows, usize) {
     for name in best.iter_mut().take(1).flatten() {
         *name = shortened(name);
     }
-    let n_columns = best.first().map_or(0, Vec::len);
-    let mut kept = n_columns;
+    let names = best.first().cloned().unwrap_or_default();
+    let mut kept = names.len();
     while kept > 2 && width_of(&best) > width {
         kept -= 1;
         for row in &mut best {
             row.truncate(kept);
         }
     }
-    (best, n_columns - kept)
+    (best, names[kept..].to_vec())
 }
 
 /// Columns `X`, `X low` and `X high` as one.
@@ -315,6 +336,13 @@ log        0  oracle
             "{shown}"
         );
         assert!(shown.contains("more columns"), "{shown}");
+        let rows = [json!({"name": "a world", "x": 1, "first_of_all": 2, "second": 3})];
+        let shown = text(&json!({"rows": rows}), 7);
+        assert!(
+            shown.lines().any(|line| line.starts_with("... ")),
+            "{shown}"
+        );
+        assert_eq!(wrapped("one two three", 9), "one two\n... three\n");
     }
 
     #[test]

@@ -11,6 +11,7 @@ mod rollouts;
 mod sumo;
 
 use std::fmt;
+use std::io;
 use std::path::{Path, PathBuf};
 
 use gump_data::{DataError, RecordLocation};
@@ -108,7 +109,7 @@ pub enum EvalError {
         /// The file or folder.
         path: PathBuf,
         /// The error of the system.
-        cause: std::io::Error,
+        cause: io::Error,
     },
 }
 
@@ -185,7 +186,7 @@ impl fmt::Display for ErrorContext {
 }
 
 impl EvalError {
-    pub(crate) fn io(doing: &'static str, path: &Path, cause: std::io::Error) -> Self {
+    pub(crate) fn io(doing: &'static str, path: &Path, cause: io::Error) -> Self {
         Self::Io {
             doing,
             path: path.to_owned(),
@@ -222,22 +223,33 @@ impl EvalError {
         sentence(self)
     }
 
-    /// Whether a different argument, rather than a different file, would help.
+    /// Whether a different argument, rather than a different file, would help: there is no file of
+    /// the name either.
     pub fn is_argument(&self) -> bool {
-        matches!(
-            self.cause(),
+        let is_missing = |cause: &io::Error| cause.kind() == io::ErrorKind::NotFound;
+        match self.cause() {
             Self::Argument(_)
-                | Self::Data(DataError::NoSuchScenario { .. } | DataError::SeveralFiles { .. })
-        )
+            | Self::Benchmark(BenchmarkError::NoSuchSplit { .. })
+            | Self::Data(
+                DataError::NoSuchScenario { .. }
+                | DataError::SeveralFiles { .. }
+                | DataError::Missing { .. },
+            ) => true,
+            Self::Io { cause, .. } | Self::Model(ModelError::Io { cause, .. }) => is_missing(cause),
+            _ => false,
+        }
     }
 }
 
-/// An error and what caused it, as one sentence.
+/// An error and what caused it, as one sentence. Causes that many errors quote are there once.
 pub(crate) fn sentence(error: &dyn std::error::Error) -> String {
     let mut sentence = error.to_string();
     let mut cause = error.source();
     while let Some(error) = cause {
-        sentence += &format!(": {error}");
+        let text = error.to_string();
+        if !sentence.contains(&text) {
+            sentence = format!("{sentence}: {text}");
+        }
         cause = error.source();
     }
     sentence
@@ -249,7 +261,7 @@ mod tests {
 
     #[test]
     fn a_sentence_names_the_cause_once() {
-        let io = std::io::Error::other("disk full");
+        let io = io::Error::other("disk full");
         let error = EvalError::io("write", Path::new("a"), io);
         assert_eq!(sentence(&error), "cannot write a: disk full");
         let scenario = ErrorContext::Scenario { id: "3".into() };
@@ -269,9 +281,14 @@ mod tests {
         let expected = "expected log, idm, constant-velocity or model:WEIGHTS";
         assert_eq!(error.to_string(), expected);
 
+        let missing = io::Error::from(io::ErrorKind::NotFound);
+        assert!(EvalError::io("read the list", Path::new("a"), missing).is_argument());
+        let missing = DataError::Missing { path: "a".into() };
+        assert!(EvalError::from(missing).is_argument());
+
         let error = EvalError::from(ResultsError::Unfinished {
             path: "out/scenarios.toml".into(),
-            cause: std::io::Error::other("not there"),
+            cause: io::Error::other("not there"),
         });
         let error = error.at(ErrorContext::Making { part: "a".into() });
         assert!(!error.is_argument());

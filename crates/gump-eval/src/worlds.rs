@@ -312,6 +312,11 @@ mod tests {
         }
         let bare: WorldName = "a/b.safetensors".parse().unwrap();
         assert_eq!(bare.to_string(), "model:a/b.safetensors");
+        for bare in ["model", "model:"] {
+            let error = bare.parse::<WorldName>().unwrap_err().to_string();
+            let shipped = "model:datasets/weights/gump-relative.safetensors";
+            assert!(error.ends_with(shipped), "{error}");
+        }
         let other = "a/b.bin".parse::<WorldName>().unwrap_err().to_string();
         assert!(
             other.ends_with("for weights in a file: model:a/b.bin"),

@@ -165,10 +165,14 @@ pub enum ShardError {
     },
 }
 
-/// The suggestion for a name that looks like the path of a file of weights.
+/// The weights that most come for, as seen from the folder of the checkout.
+const SHIPPED: &str = "datasets/weights/gump-relative.safetensors";
+
+/// The suggestion for a name that looks like the path of a file of weights, or that lacks one.
 fn weights_hint(name: &str, is_path: bool) -> String {
-    match is_path {
-        true => format!("; for weights in a file: model:{name}"),
-        false => String::new(),
+    match name {
+        "model" | "model:" => format!("; with the shipped weights: model:{SHIPPED}"),
+        _ if is_path => format!("; for weights in a file: model:{name}"),
+        _ => String::new(),
     }
 }

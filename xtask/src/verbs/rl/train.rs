@@ -23,6 +23,9 @@ use crate::sampling::Sampling;
 
 /// Time between checkpoints: what a crash may cost.
 const CHECKPOINT_EVERY: Duration = Duration::from_secs(60);
+/// Files of a run: what it is resumed from, and what it learned.
+const CHECKPOINT: &str = "checkpoint.safetensors";
+const POLICY: &str = "policy.safetensors";
 /// Points of the curves per segment. Chosen by eye.
 const POINTS_PER_SEGMENT: usize = 10;
 
@@ -51,7 +54,8 @@ pub(crate) struct Args {
     /// Begin with the policy and the critic of this run of PPO, its checkpoint.safetensors
     #[arg(long, value_name = "FILE", conflicts_with = "resume")]
     from: Option<PathBuf>,
-    /// Continue the run in --out with its original configuration
+    /// Continue the run in --out with its original configuration; without it a folder with a run is
+    /// refused
     #[arg(long)]
     resume: bool,
     #[command(flatten)]
@@ -127,6 +131,10 @@ impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         let mut settings = Settings::read(self.common.config.as_deref())?;
         settings.set_steps(self.algorithm, self.steps);
+        if self.steps == Some(0) {
+            let wrong = "--steps: expected at least 1, found 0";
+            return Err(WrongArguments(wrong.into()).into());
+        }
         if self.from.is_some() && self.algorithm != Algorithm::Ppo {
             let wrong = format!("--from: expected --algorithm ppo, found {}", self.algorithm);
             return Err(WrongArguments(wrong).into());
@@ -135,7 +143,10 @@ impl Args {
             let wrong = "--train-world: imitation learns from the log, expected log";
             return Err(WrongArguments(wrong.into()).into());
         }
-        let sampling = self.yielding.sampling(&self.sampling.resolve()?);
+        self.check_folder(run.out())?;
+        let sampling = self
+            .yielding
+            .sampling(&self.sampling.resolve_for(&[&self.train_world])?);
         let set = PreparedSet::read(run, &self.scenarios, Split::Train, None)?;
         let device = run.device().clone();
         let world = run.phase("load", |_| {
@@ -178,17 +189,36 @@ impl Args {
         }
         Ok(())
     }
+
+    /// Error: [`WrongArguments`] for a new run in the folder of an earlier one, and for none to
+    /// resume.
+    fn check_folder(&self, out: &Path) -> anyhow::Result<()> {
+        let there = |name: &&str| out.join(name).is_file();
+        let found = match self.resume {
+            true => [CHECKPOINT].iter().find(|name| there(name)),
+            false => [CHECKPOINT, POLICY].iter().find(|name| there(name)),
+        };
+        let wrong = match (self.resume, found) {
+            (true, None) => format!(
+                "--resume: expected a run in {}, found no {CHECKPOINT}",
+                out.display()
+            ),
+            (false, Some(name)) => run::would_replace(&out.join(name)),
+            _ => return Ok(()),
+        };
+        Err(WrongArguments(wrong).into())
+    }
 }
 
 impl Job<'_> {
     /// Path of the policy's file.
     pub(super) fn policy(&self) -> PathBuf {
-        self.folder.join("policy.safetensors")
+        self.folder.join(POLICY)
     }
 
     /// Path of the file that the run is resumed from.
     pub(super) fn checkpoint(&self) -> PathBuf {
-        self.folder.join("checkpoint.safetensors")
+        self.folder.join(CHECKPOINT)
     }
 
     /// The notes of a run that began with a policy of the kind `from`.

@@ -36,9 +36,12 @@ const CHECKPOINT_EVERY: Duration = Duration::from_secs(60);
 const VALIDATIONS: usize = 10;
 /// Validation samples, at most: each validation has to be quick beside training. Chosen by hand.
 const VALIDATION_SAMPLES: usize = 64;
-/// Steps over which the first and the last loss are averaged, against the noise of batches. Chosen
-/// by hand.
+/// Most steps over which the first and the last loss are averaged, against the noise of batches; it is
+/// a tenth of the steps, so that the two are of different steps. Chosen by hand.
 const WINDOW: usize = 20;
+
+/// The most samples of a step that can be meant.
+const MOST_SAMPLES: usize = 65_536;
 
 /// Files that a stage writes.
 const CHECKPOINT: &str = "checkpoint.safetensors";
@@ -73,7 +76,8 @@ pub(crate) struct Args {
     /// Stop after this step; continue with --resume
     #[arg(long, value_name = "N")]
     stop_at: Option<usize>,
-    /// Continue the run in --out with its original configuration
+    /// Continue the run in --out with its original configuration; without it a folder with a run is
+    /// refused
     #[arg(long)]
     resume: bool,
     /// Futures of each of up to 8 validation scenes for realism, evaluated ten times per run; 0
@@ -92,13 +96,30 @@ enum Begin {
     Resume,
 }
 
-/// Whether a run to resume has been in a folder, or in that of a stage within it.
-fn was_trained_in(out: &Path) -> bool {
+/// The first file with what an earlier run learned, in a folder or in that of a stage within it.
+fn learned_in(out: &Path, names: &[&str]) -> Option<PathBuf> {
     let folders = std::fs::read_dir(out).into_iter().flatten().flatten();
-    let inside = folders.map(|entry| entry.path());
-    std::iter::once(out.to_owned())
-        .chain(inside)
-        .any(|folder| folder.join(CHECKPOINT).is_file())
+    let is_stage = |entry: &std::fs::DirEntry| {
+        let name = entry.file_name();
+        name.to_string_lossy().starts_with(stages::FOLDER)
+    };
+    let stages = folders.filter(is_stage).map(|entry| entry.path());
+    let mut files = std::iter::once(out.to_owned())
+        .chain(stages)
+        .flat_map(|folder| names.iter().map(move |name| folder.join(name)));
+    files.find(|file| file.is_file())
+}
+
+/// Refuses a batch that cannot be meant.
+///
+/// Error: [`WrongArguments`].
+fn check_batch(batch: usize) -> Result<(), WrongArguments> {
+    match batch > MOST_SAMPLES {
+        true => Err(WrongArguments(format!(
+            "--batch: expected at most {MOST_SAMPLES} samples, found {batch}"
+        ))),
+        false => Ok(()),
+    }
 }
 
 impl Args {
@@ -136,11 +157,17 @@ impl Args {
                 )
             }
             (_, Some(0)) => "--steps: expected at least 1, found 0".into(),
-            _ if self.resume && !was_trained_in(run.out()) => format!(
-                "--resume: expected a run in {}, found none",
-                run.out().display()
-            ),
-            _ => return Ok(()),
+            _ if self.resume => match learned_in(run.out(), &[CHECKPOINT]) {
+                Some(_) => return Ok(()),
+                None => format!(
+                    "--resume: expected a run in {}, found none",
+                    run.out().display()
+                ),
+            },
+            _ => match learned_in(run.out(), &[CHECKPOINT, WEIGHTS]) {
+                Some(file) => run::would_replace(&file),
+                None => return Ok(()),
+            },
         };
         Err(WrongArguments(wrong).into())
     }
@@ -489,8 +516,16 @@ fn report_run(
         "tokens_per_second",
         tokens as f64 / began.elapsed().as_secs_f64(),
     )?;
-    run.result("loss_first", losses.mean_of_first(WINDOW))?;
-    run.result("loss_last", losses.mean_of_last(WINDOW))?;
+    let window = (losses.steps() / 10).clamp(1, WINDOW);
+    run.result("loss_first", losses.mean_of_first(window))?;
+    run.result("loss_last", losses.mean_of_last(window))?;
+    run.print(&format!(
+        "losses are in nats; loss_first and loss_last are means of the first and of the last {}",
+        match window {
+            1 => "step".into(),
+            n => format!("{n} steps"),
+        }
+    ));
     run.result("validation_loss", losses.last_validation())?;
     run.result("validation_realism", losses.last_realism())
 }

@@ -12,7 +12,9 @@ use serde::Deserialize;
 use toml::Table;
 
 use super::stages::{self, Stage};
-use super::{Args, CHECKPOINT, HeldOut, LOSSES, Learns, WEIGHTS, learn, report_run, write};
+use super::{
+    Args, CHECKPOINT, HeldOut, LOSSES, Learns, WEIGHTS, check_batch, learn, report_run, write,
+};
 use crate::cli::WrongArguments;
 use crate::losses::Losses;
 use crate::peers::Processes;
@@ -117,6 +119,7 @@ fn config(args: &Args, table: &Table) -> anyhow::Result<Config> {
         toml::from_str(&table.to_string()).map_err(|error| wrong(error.message().to_owned()))?;
     config.train.steps = args.steps.unwrap_or(config.train.steps);
     config.train.batch = args.batch.unwrap_or(config.train.batch);
+    check_batch(config.train.batch)?;
     config.train.seed = args.common.seed.unwrap_or(config.train.seed);
     let checked = config.train.validate();
     checked.map_err(|error| wrong(error.to_string()))?;

@@ -18,8 +18,8 @@ use toml::Table;
 use super::realism::Judge;
 use super::stages::{self, Stage};
 use super::{
-    Args, CHECKPOINT, HeldOut, LOSSES, Learns, WEIGHTS, learn, report_run, warn_of_slow_bfloat16,
-    write,
+    Args, CHECKPOINT, HeldOut, LOSSES, Learns, WEIGHTS, check_batch, learn, report_run,
+    warn_of_slow_bfloat16, write,
 };
 use crate::cli::WrongArguments;
 use crate::losses::Losses;
@@ -253,6 +253,7 @@ fn config(args: &Args, table: &Table) -> anyhow::Result<Config> {
         toml::from_str(&table.to_string()).map_err(|error| wrong(error.message().to_owned()))?;
     config.train.steps = args.steps.unwrap_or(config.train.steps);
     config.train.batch = args.batch.unwrap_or(config.train.batch);
+    check_batch(config.train.batch)?;
     config.train.seed = args.common.seed.unwrap_or(config.train.seed);
     let checked = config.relative.validate().map_err(TrainError::from);
     checked

@@ -13,10 +13,13 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use toml::{Table, Value};
 
-use super::Args;
+use super::{Args, check_batch};
 use crate::cli::WrongArguments;
 use crate::run::print_error;
 use crate::{config, words};
+
+/// What the names of the folders of stages begin with; a number follows.
+pub(super) const FOLDER: &str = "stage-";
 
 /// A part of a run with a separate schedule.
 #[derive(Debug)]
@@ -113,7 +116,7 @@ impl Args {
                         None => usize::MAX,
                         Some(other) => return Err(wrong(path, "stop_at", "a step", other)),
                     },
-                    folder: format!("stage-{}", i + 1).into(),
+                    folder: format!("{FOLDER}{}", i + 1).into(),
                 },
             })
         });
@@ -140,6 +143,7 @@ impl Args {
             RunConfig::from_toml(&table.to_string()).map_err(|error| wrong(error.to_string()))?;
         config.train.steps = self.steps.unwrap_or(config.train.steps);
         config.train.batch = self.batch.unwrap_or(config.train.batch);
+        check_batch(config.train.batch)?;
         config.train.seed = self.common.seed.unwrap_or(config.train.seed);
         let checked = config.model().and_then(|model| Ok(model.validate()?));
         checked
