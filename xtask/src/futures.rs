@@ -1,4 +1,4 @@
-//! Futures as files: an array for analysis, and a picture.
+//! Futures as files, an array for analysis and a picture; and how many can be meant.
 
 use std::io::Write as _;
 use std::path::Path;
@@ -8,6 +8,74 @@ use gump_eval::digest::numbers;
 use gump_scene::{Agent, AgentId, Rollout, Scenario};
 use gump_viz::{Camera, Picture, PictureSpec, draw_futures};
 use serde_json::json;
+
+use crate::cli::WrongArguments;
+use crate::machine;
+
+/// The most futures of a scene: the challenges ask for 32.
+const MOST_FUTURES: usize = 65_536;
+/// Bytes of a future per step and agent: 512 futures of 8 s of 47 agents take 344 MB.
+const BYTES_PER_STATE: f64 = 180.0;
+
+/// Refuses numbers of futures and of seconds that cannot be meant.
+///
+/// Error: [`WrongArguments`].
+pub(crate) fn check(n_futures: usize, seconds: f64) -> Result<(), WrongArguments> {
+    // A step of a recording at least, and at most an hour.
+    if !(0.1..=3600.0).contains(&seconds) {
+        return Err(WrongArguments(format!(
+            "--seconds: expected a number from 0.1 to 3600, found {seconds}"
+        )));
+    }
+    check_number("--futures", n_futures)
+}
+
+/// Refuses numbers of futures that cannot be meant.
+///
+/// Error: [`WrongArguments`].
+pub(crate) fn check_number(flag: &str, n_futures: usize) -> Result<(), WrongArguments> {
+    match n_futures > MOST_FUTURES {
+        true => Err(WrongArguments(format!(
+            "{flag}: expected at most {MOST_FUTURES}, found {n_futures}"
+        ))),
+        false => Ok(()),
+    }
+}
+
+/// Refuses more futures of a scene than the memory of the machine holds; they are in memory until they
+/// are written.
+///
+/// Error: [`WrongArguments`].
+pub(crate) fn check_memory(
+    scenario: &Scenario,
+    n_futures: usize,
+    seconds: f64,
+) -> Result<(), WrongArguments> {
+    match machine::memory_bytes() {
+        Some(memory) => check_fits(scenario, n_futures, seconds, memory),
+        None => Ok(()),
+    }
+}
+
+fn check_fits(
+    scenario: &Scenario,
+    n_futures: usize,
+    seconds: f64,
+    memory: f64,
+) -> Result<(), WrongArguments> {
+    let n_agents = scenario.present().now().agents().len();
+    let steps = (seconds / scenario.dt).round().max(1.0);
+    let bytes = BYTES_PER_STATE * n_agents as f64 * steps;
+    let most = (memory / bytes.max(1.0)).floor();
+    if n_futures as f64 <= most {
+        return Ok(());
+    }
+    Err(WrongArguments(format!(
+        "--futures: expected at most {most}, which the {:.0} GB of this machine hold of {seconds} s \
+         of {n_agents} agents, found {n_futures}",
+        memory / 1e9
+    )))
+}
 
 /// Most numbers of an array: half a gigabyte. Agents that come and leave have a column each, so that an
 /// hour of traffic at 10 Hz would be four.
@@ -126,6 +194,23 @@ mod tests {
         .unwrap();
         let log = log_as_rollout(&scenario);
         (scenario, vec![log; 2])
+    }
+
+    #[test]
+    fn futures_beyond_the_memory_of_a_machine_are_refused() {
+        let (scenario, _) = rollouts();
+        // Two agents for two seconds: 7,200 bytes a future.
+        assert!(check_fits(&scenario, 100, 2.0, 1e6).is_ok());
+        let error = check_fits(&scenario, 200, 2.0, 1e6)
+            .unwrap_err()
+            .to_string();
+        assert!(
+            error.starts_with("--futures: expected at most 138, "),
+            "{error}"
+        );
+        assert!(error.ends_with("of 2 s of 2 agents, found 200"), "{error}");
+        assert!(check(MOST_FUTURES, 8.0).is_ok() && check(1, 0.0).is_err());
+        assert!(check(MOST_FUTURES + 1, 8.0).is_err() && check(1, f64::NAN).is_err());
     }
 
     #[test]

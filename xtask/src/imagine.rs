@@ -5,13 +5,14 @@ use gump_eval::worlds::World;
 use gump_rollout::{ProbeConfig, SimulateConfig};
 use gump_scene::{Scenario, Seed};
 
+use crate::futures;
 use crate::run::Run;
 
 pub(crate) use gump_eval::imagine::Imagined;
 
 /// Imagines `n_futures` of what comes after the present; the world drives the ego too.
 ///
-/// Error: as [`eval::imagine`], Ctrl-C among them.
+/// Error: as [`eval::imagine`], Ctrl-C among them, and [`futures::check_memory`].
 pub(crate) fn imagine(
     run: &Run,
     world: &World,
@@ -20,6 +21,7 @@ pub(crate) fn imagine(
     config: &SimulateConfig,
     seed: Seed,
 ) -> anyhow::Result<Imagined> {
+    futures::check_memory(scenario, n_futures, config.seconds)?;
     let progress = run.simulating(Some(eval::frames(scenario, n_futures, config)));
     let imagined = eval::imagine(world, scenario, n_futures, config, seed, &progress);
     Ok(imagined?)
@@ -36,6 +38,7 @@ pub(crate) fn imagine_probed(
     config: &SimulateConfig,
     probe: ProbeConfig,
 ) -> anyhow::Result<Imagined> {
+    futures::check_memory(scenario, n_futures, config.seconds)?;
     let (seed, progress) = (
         run.seed(),
         run.simulating(Some(eval::frames(scenario, n_futures, config))),

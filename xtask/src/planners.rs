@@ -151,6 +151,11 @@ impl YieldingName {
     }
 }
 
+/// The most futures of a candidate and the most drives of the network's own ego: the planner has four
+/// and none, and each is simulated at every decision.
+const MOST_FUTURES: usize = 1024;
+const MOST_MODES: usize = 64;
+
 /// Settings of planners with rollouts.
 #[derive(Clone, Debug, Serialize, clap::Args)]
 pub(crate) struct ImaginationArgs {
@@ -222,11 +227,33 @@ impl ImaginationArgs {
                 return Err(WrongArguments(wrong).into());
             }
         }
+        for (flag, number, most) in [
+            ("--futures", self.futures, MOST_FUTURES),
+            ("--network-modes", self.network_modes, MOST_MODES),
+        ] {
+            if number > most {
+                let wrong = format!("{flag}: expected at most {most}, found {number}");
+                return Err(WrongArguments(wrong).into());
+            }
+        }
         for (flag, share) in [("--hedge", self.hedge), ("--hysteresis", self.hysteresis)] {
             if !(0.0..=1.0).contains(&share) {
                 let wrong = format!("{flag}: expected a number from 0 to 1, found {share}");
                 return Err(WrongArguments(wrong).into());
             }
+        }
+        let wrong = if !(0.5..=4.0).contains(&self.horizon) {
+            format!(
+                "--horizon: expected a number of seconds from 0.5 to 4, found {}",
+                self.horizon
+            )
+        } else if let Some(x) = self.discount.filter(|x| !(*x > 0.0 && *x <= 1.0)) {
+            format!("--discount: expected a number above 0 and at most 1, found {x}")
+        } else {
+            String::new()
+        };
+        if !wrong.is_empty() {
+            return Err(WrongArguments(wrong).into());
         }
         Ok(PlannerConfig {
             futures: self.futures,

@@ -367,7 +367,7 @@ fn predictions_come_from_files_of_either_kind() {
     let unknown = "predictions of \"x\", which is not among the scenarios";
     fails(&folder, &words("three.binproto"), 1, unknown);
     fails(&folder, &words("two.tfrecord"), 1, "expected a");
-    fails(&folder, &words("nothing"), 1, "nothing");
+    fails(&folder, &words("nothing"), 2, "nothing");
     let neither = "evaluate motion --scenarios two.tfrecord";
     fails(&folder, neither, 2, "--world");
     let wrong_shard = format!("{neither} --world idm --shard 3/2");
@@ -646,10 +646,10 @@ fn behaviour_refuses_what_it_cannot_count() {
     fails(
         &folder,
         "evaluate behaviour --scenarios nowhere --world idm",
-        1,
+        2,
         "nowhere",
     );
-    fails(&folder, &format!("{verb} --world model:none"), 1, "none");
+    fails(&folder, &format!("{verb} --world model:none"), 2, "none");
 }
 
 /// The row of `evaluate reactions` of a world and a manoeuvre.
@@ -777,7 +777,7 @@ fn reactions_refuse_what_they_cannot_measure() {
     fails(
         &folder,
         "evaluate reactions --scenarios nowhere --world idm",
-        1,
+        2,
         "nowhere",
     );
 }

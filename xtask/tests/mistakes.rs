@@ -115,6 +115,18 @@ fn numbers_that_cannot_be_meant_are_told_plainly() {
         "--seconds: expected a number from 0.1 to 3600",
     );
     check("--futures -3", "found -3");
+    check("--futures 65537", "--futures: expected at most 65536");
+    check("--threads 100000", "--threads: expected at most 1024");
+    place.check(
+        "ablate nar --scenario scene.tfrecord --seconds 0",
+        2,
+        &["--seconds: expected a number from 0.1"],
+    );
+    place.check(
+        "train --data scene.tfrecord --batch 100000000",
+        2,
+        &["--batch: expected at most 65536 samples"],
+    );
     assert!(!place.path("out/simulate/film.gif").exists());
 }
 
@@ -164,12 +176,19 @@ fn weights_are_found_or_hinted_at() {
         text(&hint.stderr)
     );
     // A name that can only be weights is taken for weights, which are not there.
-    place.check(&world("w.safetensors"), 1, &["w.safetensors"]);
+    place.check(&world("w.safetensors"), 2, &["w.safetensors"]);
     place.check(
         "simulate -s scene.tfrecord --weights w.safetensors",
-        1,
+        2,
         &["w.safetensors"],
     );
+    for bare in ["model", "model:"] {
+        let output = place.run(&world(bare));
+        let error = text(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{error}");
+        let shipped = "model:datasets/weights/gump-relative.safetensors";
+        assert!(error.contains(shipped), "{error}");
+    }
 }
 
 #[test]
@@ -184,6 +203,41 @@ fn shares_of_a_planner_are_from_0_to_1() {
         let expected = format!("{flag}: expected a number from 0 to 1, found {found}");
         place.check(&format!("{words} {flag} {found}"), 2, &[&expected]);
     }
+    for (flag, found, range) in [
+        ("--horizon", "0", "a number of seconds from 0.5 to 4"),
+        ("--discount", "7", "a number above 0 and at most 1"),
+        ("--futures", "100000", "at most 1024"),
+        ("--network-modes", "100000", "at most 64"),
+    ] {
+        let expected = format!("{flag}: expected {range}, found {found}");
+        place.check(&format!("{words} {flag} {found}"), 2, &[&expected]);
+        let plan = format!("plan --scenario scene.tfrecord {flag} {found}");
+        place.check(&plan, 2, &[&expected]);
+    }
+}
+
+#[test]
+fn names_of_nothing_are_wrong_arguments() {
+    let place = Workplace::new();
+    let simulate = "simulate --scenario scene.tfrecord --world idm";
+    let check = |words: &str, part: &str| place.check(words, 2, &[part]);
+    check("data inspect none.tfrecord", "none.tfrecord");
+    check(&format!("{simulate} --config none.toml"), "none.toml");
+    check(
+        "evaluate behaviour --world idm --scenarios scene.tfrecord#1",
+        "found the name of one scenario: scene.tfrecord#1",
+    );
+    let lists = Path::new(env!("CARGO_MANIFEST_DIR")).join("../datasets/benchmarks");
+    let list = lists.join("recorded.toml").display().to_string();
+    let wosac = "evaluate wosac --world idm --scenarios";
+    check(&format!("{wosac} {list}#foo"), "found ");
+    place.write_map();
+    let fix = "[[object]]\nid = \"a\"\nclass = \"tram\"\n";
+    fs::write(place.path("fix.toml"), fix).unwrap();
+    let generate = "generate --map map.tfrecord --fix fix.toml";
+    let error = text(&place.run(generate).stderr);
+    assert_eq!(error.matches("line 3").count(), 1, "{error}");
+    check(generate, "--fix fix.toml: line 3: ");
 }
 
 #[test]
@@ -288,7 +342,7 @@ fn a_map_is_all_that_generation_needs() {
     place.check(&format!("data inspect {network}"), 1, &["SUMO network"]);
     // What is missing to the driver is what the test withholds: the weights, not agents.
     let generate = "generate --map map.tfrecord --vehicles 1 --weights none.safetensors";
-    place.check(generate, 1, &["none.safetensors"]);
+    place.check(generate, 2, &["none.safetensors"]);
 }
 
 #[test]

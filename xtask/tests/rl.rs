@@ -81,6 +81,11 @@ const TRAIN: &str = "rl train --scenarios scene.tfrecord --algorithm";
 fn a_policy_learns_goes_on_and_is_evaluated() {
     let place = Workplace::new();
     for words in ["sac --train-world idm", "ppo", "imitation"] {
+        for folder in ["whole", "halves"].map(|name| place.path(name)) {
+            if folder.exists() {
+                fs::remove_dir_all(folder).unwrap();
+            }
+        }
         let whole = place.results(&format!("{TRAIN} {words}"), "whole");
         assert_eq!(
             (&whole["steps"], &whole["scenarios"]),
@@ -353,7 +358,7 @@ fn lists_of_scenes_are_learned_from_and_tested_on_by_split() {
         (&table["train_set"], &table["set"]),
         (&"small/train".into(), &"small/test".into())
     );
-    place.fails(&format!("{train}#tune"), 1, "#SPLIT with train or test");
+    place.fails(&format!("{train}#tune"), 2, "#SPLIT with train or test");
 }
 
 #[test]
@@ -366,10 +371,16 @@ fn what_cannot_be_is_refused() {
     );
     place.fails(
         &format!("{TRAIN} sac --resume --out nowhere"),
-        1,
-        "checkpoint.safetensors",
+        2,
+        "found no checkpoint.safetensors",
     );
     place.results(&format!("{TRAIN} sac"), "run");
+    let before = bytes(&place.path("run"), "policy.safetensors");
+    for flags in ["", " --seed 3", " --from run/checkpoint.safetensors"] {
+        let words = format!("{TRAIN} ppo{flags} --out run");
+        place.fails(&words, 2, "would replace: continue that run with --resume");
+    }
+    assert!(bytes(&place.path("run"), "policy.safetensors") == before);
     place.fails(
         &format!("{TRAIN} sac --resume --steps 50 --out run"),
         2,

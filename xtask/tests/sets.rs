@@ -96,7 +96,7 @@ fn a_list_makes_the_same_scenes_anywhere_and_results_name_it() {
     fails(
         &folder,
         &format!("{words} --scenarios small.toml#test"),
-        1,
+        2,
         "with tune, found",
     );
     // One digit of a sum.
@@ -129,7 +129,7 @@ fn a_list_makes_the_same_scenes_anywhere_and_results_name_it() {
     fails(
         &folder,
         "data benchmark --list nowhere.toml",
-        1,
+        2,
         "cannot read the list",
     );
     fails(

@@ -249,6 +249,12 @@ fn a_run_in_stages_goes_on_from_stage_to_stage() {
     assert_eq!((steps("stage-1"), steps("stage-2")), (2, 3));
     let weights = fs::read(place.path("out/stage-2/weights.safetensors")).unwrap();
 
+    // Another run does not replace one in stages, finished or not.
+    place.fails(
+        "s.toml --out out",
+        2,
+        &["out/weights.safetensors", "--resume"],
+    );
     // By hand: the second stage goes on from the first one's network, in full precision.
     fs::remove_dir_all(place.path("out/stage-2")).unwrap();
     let resumed = place.results("s.toml --resume", "out");

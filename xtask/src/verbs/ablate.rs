@@ -73,6 +73,7 @@ pub(crate) struct Args {
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
+        futures::check(self.futures.get(), self.seconds)?;
         let name = match &self.scenario {
             Some(name) => name.clone(),
             None => shipped::scenario(),
@@ -111,6 +112,7 @@ impl Args {
         let ([full, partial], [full_part, partial_part]) = &pairs[0];
         let ratio = partial.frames_per_second() / full.frames_per_second();
         run.result("ratio", ratio)?;
+        run.print("ratio: frames per second of partial-AR over those of full-AR");
         run.result("difference", difference(partial_part, full_part))?;
         let pictures = [
             ("full-AR", &full.rollouts),

@@ -189,7 +189,7 @@ impl Args {
         };
         let text = std::fs::read_to_string(path)
             .with_context(|| format!("cannot read {}", path.display()))?;
-        parse_constraints(&text).with_context(|| path.display().to_string())
+        parse_constraints(&text).map_err(|error| self.wrong_request(error))
     }
 
     fn counts(&self) -> Option<Counts> {
@@ -237,24 +237,30 @@ impl Args {
         for first in (0..n).step_by(batch as usize) {
             stop_if_interrupted()?;
             let numbers = first..(first + batch).min(n);
-            for checked in make_many(worlds, order, numbers, run.seed()).map_err(too_many)? {
-                all.push(checked.map_err(too_many)?);
+            let wrong = |error| self.wrong_request(error);
+            for checked in make_many(worlds, order, numbers, run.seed()).map_err(wrong)? {
+                all.push(checked.map_err(wrong)?);
                 progress.advance(1);
             }
         }
         Ok((all, began.elapsed()))
     }
-}
 
-/// Turns a request for more objects than a scene can hold into [`WrongArguments`].
-fn too_many(error: GenerateError) -> anyhow::Error {
-    match error {
-        GenerateError::TooMany { requested, max } => WrongArguments(format!(
-            "--vehicles, --bicycles, --pedestrians: expected at most {max} objects with the ego and \
-             what stands on the map, found {requested}"
-        ))
-        .into(),
-        other => other.into(),
+    /// Turns a request that no scene can meet into [`WrongArguments`]: contradictory constraints, or
+    /// more objects than a scene can hold.
+    fn wrong_request(&self, error: GenerateError) -> anyhow::Error {
+        let wrong = match error {
+            GenerateError::TooMany { requested, max } => format!(
+                "--vehicles, --bicycles, --pedestrians: expected at most {max} objects with the ego \
+                 and what stands on the map, found {requested}"
+            ),
+            GenerateError::Constraints(why) => match &self.fix {
+                Some(path) => format!("--fix {}: {why}", path.display()),
+                None => format!("constraints: {why}"),
+            },
+            other => return other.into(),
+        };
+        WrongArguments(wrong).into()
     }
 }
 

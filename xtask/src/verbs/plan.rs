@@ -171,7 +171,8 @@ impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
         self.driving.check()?;
         self.film.check()?;
-        let sampling = self.sampling.resolve()?;
+        let sampling = self.sampling.resolve_for(&[&self.world])?;
+        let thinking = self.thinking.config()?;
         self.check_explain(None)?;
         let case = run.phase("read", |_| Ok(recordings::find(&self.scenario)?))?;
         self.check_explain(Some(case.recording.scenario()))?;
@@ -187,9 +188,7 @@ impl Args {
             )?)
         })?;
         let imagination = imagined.imagination();
-        let inner = self
-            .planner
-            .build(&case, imagination, seed, &self.thinking.config()?)?;
+        let inner = self.planner.build(&case, imagination, seed, &thinking)?;
         let mut noted = Noted {
             inner,
             steps: Vec::new(),
@@ -211,6 +210,13 @@ impl Args {
         })?;
         let milliseconds = timed.milliseconds_per_step();
         let scenario = case.recording.scenario();
+        let driven = self.steps(scenario) as f64 * scenario.dt;
+        if driven + 0.5 * scenario.dt < self.driving.seconds {
+            run.print(&format!(
+                "drove {driven:.1} of {} s, the recording ends",
+                self.driving.seconds
+            ));
+        }
         run.phase("write", |run| {
             let label = films::label(self.planner.name(), &self.world);
             self.film
@@ -258,8 +264,7 @@ impl Args {
                 self.planner.name()
             )
         } else if let (Some(scenario), Step::Number(step)) = (scenario, requested) {
-            let recorded = scenario.log.len() - scenario.now - 1;
-            let steps = recorded.min((self.driving.seconds / scenario.dt).round() as usize);
+            let steps = self.steps(scenario);
             if step < steps {
                 return Ok(());
             }
@@ -271,6 +276,12 @@ impl Args {
             return Ok(());
         };
         Err(WrongArguments(wrong).into())
+    }
+
+    /// Steps of the drive: a recording may be shorter than what is to be driven.
+    fn steps(&self, scenario: &Scenario) -> usize {
+        let recorded = scenario.log.len() - scenario.now - 1;
+        recorded.min((self.driving.seconds / scenario.dt).round() as usize)
     }
 
     /// Writes the page of the requested decision.

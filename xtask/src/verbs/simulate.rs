@@ -2,6 +2,7 @@
 
 mod scenes;
 
+use std::collections::BTreeSet;
 use std::num::NonZeroUsize;
 
 use anyhow::Context as _;
@@ -10,7 +11,7 @@ use gump_eval::digest;
 use gump_eval::worlds::{World, WorldName};
 use gump_metrics::{Part, Summary, summarize};
 use gump_rollout::ProbeConfig;
-use gump_scene::{Rollout, Scenario};
+use gump_scene::{AgentId, Frame, Rollout, Scenario};
 use gump_viz::Viewer;
 use serde::Serialize;
 use serde_json::{Value, json};
@@ -21,9 +22,6 @@ use crate::imagine::{Imagined, imagine_probed};
 use crate::run::{Common, Run};
 use crate::sampling::Sampling;
 use crate::{annotations, futures, notes, tables};
-
-/// The most futures of one run: they are held in memory until they are written.
-const MOST_FUTURES: usize = 65_536;
 
 /// Arguments of `simulate`.
 #[derive(Debug, Serialize, clap::Args)]
@@ -76,16 +74,7 @@ enum Format {
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
-        if !(0.1..=3600.0).contains(&self.seconds) {
-            let found = self.seconds;
-            let wrong = format!("--seconds: expected a number from 0.1 to 3600, found {found}");
-            return Err(WrongArguments(wrong).into());
-        }
-        if self.futures.get() > MOST_FUTURES {
-            let found = self.futures;
-            let wrong = format!("--futures: expected at most {MOST_FUTURES}, found {found}");
-            return Err(WrongArguments(wrong).into());
-        }
+        futures::check(self.futures.get(), self.seconds)?;
         if self.heat.is_some() && !matches!(self.world, WorldName::Model(_)) {
             let wrong = format!(
                 "--heat: expected --world model:WEIGHTS, found {}",
@@ -129,11 +118,13 @@ impl Args {
             imagine_probed(run, &world, &scenario, n, &config, self.probe())
                 .with_context(|| format!("cannot simulate {}", self.scenario))
         })?;
-        let summary = run.phase("score", |_| {
+        let summary = run.phase("score", |run| {
+            let _waiting = run.wait("scoring");
             Ok(summarize(&imagined.rollouts, Some(&scenario)))
         })?;
         let mut viewer = Viewer::new(&scenario);
-        run.phase("look closer", |_| {
+        run.phase("look closer", |run| {
+            let _waiting = run.wait("looking closer");
             annotations::realism(&mut viewer, &scenario, &imagined.rollouts);
             annotations::heat(&mut viewer, std::mem::take(&mut imagined.samples));
             Ok(())
@@ -143,7 +134,10 @@ impl Args {
         })?;
         run.result("decoding", decoding.name)?;
         self.report(run, &scenario, &imagined, &summary)?;
-        notes::report(run, &world.notes(&scenario), 1)
+        notes::report(run, &world.notes(&scenario), 1)?;
+        run.print(&compared(&scenario, &imagined.rollouts));
+        run.print(&format!("open {}", run.path("viewer.html").display()));
+        Ok(())
     }
 
     fn write<'a>(
@@ -210,8 +204,43 @@ impl Args {
         run.result("collision_rate", total.collision_rate())?;
         run.result("offroad_rate", total.offroad_rate())?;
         run.result("digest", digest::of_rollouts(rollouts))?;
+        if self.sampling.draw.has_life() {
+            let [arrivals, departures] = comings_and_goings(rollouts);
+            run.result("arrivals_per_future", arrivals)?;
+            run.result("departures_per_future", departures)?;
+        }
         run.result("by_class", by_class(summary))
     }
+}
+
+/// What the distances of the table are, and over which part of the futures.
+fn compared(scenario: &Scenario, rollouts: &[Rollout]) -> String {
+    let steps = rollouts.first().map_or(0, Rollout::steps);
+    match scenario.future().len().min(steps) {
+        0 => "ade, fde, min_ade, min_fde: none, the log ends with the present".into(),
+        n => format!(
+            "ade, fde, min_ade, min_fde: metres from the log, over the {:.1} s that it goes on for",
+            n as f64 * scenario.dt
+        ),
+    }
+}
+
+/// Agents that arrive and that leave, mean per future.
+fn comings_and_goings(rollouts: &[Rollout]) -> [f64; 2] {
+    let ids = |frame: &Frame| -> BTreeSet<AgentId> {
+        frame.agents().iter().map(|agent| agent.id).collect()
+    };
+    let (mut arrivals, mut departures) = (0, 0);
+    for rollout in rollouts {
+        let mut before = ids(rollout.start());
+        for frame in rollout.imagined() {
+            let now = ids(frame);
+            arrivals += now.difference(&before).count();
+            departures += before.difference(&now).count();
+            before = now;
+        }
+    }
+    [arrivals, departures].map(|n| n as f64 / rollouts.len().max(1) as f64)
 }
 
 /// The rows of a summary, all classes together last.
@@ -236,4 +265,37 @@ fn row(class: &str, part: &Part, n_futures: usize) -> Value {
         "fde": part.fde(),
         "min_fde": part.min_fde(),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn scene(text: &str) -> Scenario {
+        gump_scene::fixture::scenario(text).unwrap()
+    }
+
+    #[test]
+    fn agents_that_come_and_go_are_counted() {
+        let here = scene("ego vehicle 0: 0,0\nagent vehicle 1: 9,0\nhistory 0 future 0.2 dt 0.1");
+        let there = scene("ego vehicle 0: 0,0\nagent vehicle 2: 9,0\nhistory 0 future 0.2 dt 0.1");
+        let mut rollout = Rollout::begin(here.present());
+        rollout.push(here.present().now().clone());
+        let still = rollout.clone();
+        rollout.push(there.present().now().clone());
+        assert_eq!(comings_and_goings(&[still, rollout]), [0.5, 0.5]);
+        assert_eq!(comings_and_goings(&[]), [0.0, 0.0]);
+    }
+
+    #[test]
+    fn distances_say_what_they_are_of() {
+        let scene = scene("ego vehicle 0: 0,0\nhistory 0 future 2 dt 0.1");
+        let log = gump_metrics::logged(&scene);
+        let said = compared(&scene, &[log]);
+        assert!(
+            said.contains("metres") && said.contains("over the 2.0 s"),
+            "{said}"
+        );
+        assert!(compared(&scene, &[]).contains("none"));
+    }
 }

@@ -166,6 +166,11 @@ impl Total {
             ..self.summary.clone()
         });
         run.result("by_class", by_class)?;
-        notes::report(run, &self.notes, self.rows.len())
+        notes::report(run, &self.notes, self.rows.len())?;
+        run.print(
+            "ade, fde, min_ade, min_fde: metres from the log, over as much of the futures as it has",
+        );
+        run.print(&format!("open {}", run.path("viewer.html").display()));
+        Ok(())
     }
 }

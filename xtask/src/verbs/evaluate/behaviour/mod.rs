@@ -18,10 +18,10 @@ use gump_eval::worlds::WorldName;
 use serde::Serialize;
 
 use super::columns::columns;
-use crate::benchmark;
 use crate::run::{Common, Run};
 use crate::sampling::Sampling;
 use crate::sharding::shard;
+use crate::{benchmark, futures};
 pub(crate) use report::report_merged;
 
 /// The possible horizons, seconds: that of the challenges, half a minute and a minute.
@@ -68,6 +68,7 @@ impl Args {
         reason = "the store takes the error of the library as it is, once for each scenario"
     )]
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
+        futures::check_number("--futures", self.futures.get())?;
         let columns = columns(&self.world, &self.sampling)?;
         let scenarios = benchmark::find(run, &self.scenarios)?;
         let settings = self.settings(run, &scenarios, &columns)?;

@@ -17,12 +17,12 @@ use gump_wosac::motion::{MotionConfig, ShapeRules};
 use serde::Serialize;
 
 use super::exclusions;
-use crate::benchmark;
 use crate::choices::{SHAPES, one_of};
 use crate::cli::WrongArguments;
 use crate::run::{Common, Run};
 use crate::sampling::Sampling;
 use crate::sharding::shard;
+use crate::{benchmark, futures};
 
 pub(crate) use self::report::report_merged;
 
@@ -99,6 +99,7 @@ fn config(shapes: ShapeRules) -> MotionConfig {
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
+        futures::check_number("--futures", self.futures.get())?;
         let config = config(self.shapes);
         let mut source = run.phase("load", |run| self.predictions(run))?;
         let scenarios = benchmark::find(run, &self.scenarios)?;

@@ -22,7 +22,7 @@ use super::columns::columns;
 use crate::run::{Common, Run};
 use crate::sampling::Sampling;
 use crate::sharding::shard;
-use crate::{benchmark, shipped};
+use crate::{benchmark, futures, shipped};
 pub(crate) use report::report_merged;
 
 /// Arguments of `evaluate reactions`.
@@ -79,6 +79,7 @@ impl Args {
         reason = "the store takes the error of the library as it is, once for each scenario"
     )]
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
+        futures::check_number("--futures", self.futures.get())?;
         let columns = columns(&self.world, &self.sampling)?;
         let scenarios = benchmark::find(run, &self.scenarios)?;
         let settings = self.settings(run, &scenarios, &columns)?;

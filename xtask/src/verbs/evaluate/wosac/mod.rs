@@ -22,13 +22,12 @@ use gump_wosac::realism::{Attribution, Config, Mode, Year};
 use serde::{Deserialize, Serialize};
 
 use super::exclusions;
-use crate::benchmark;
 use crate::choices::{YEARS, one_of};
 use crate::cli::WrongArguments;
 use crate::run::{Common, Run};
 use crate::sampling::Sampling;
 use crate::sharding::shard;
-use crate::tables;
+use crate::{benchmark, futures, tables};
 pub(crate) use report::report_merged;
 use worst::Worst;
 
@@ -110,6 +109,7 @@ const N_EXPLAINED: usize = 20;
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
+        futures::check_number("--rollouts-per-scenario", self.rollouts_per_scenario.get())?;
         let shard = self.shard.unwrap_or(Shard::WHOLE);
         let scenarios = benchmark::find(run, &self.scenarios)?;
         let settings = self.settings(run, &scenarios)?;
@@ -200,6 +200,7 @@ impl Args {
             }
             (Some(world), None) => {
                 let (n, seed) = (self.rollouts_per_scenario.get(), run.seed());
+                self.sampling.check(&[world])?;
                 let decodings = self.sampling.decodings(world)?.into_iter();
                 let sources =
                     decodings.map(|way| RolloutSource::world(world.clone(), way, n, seed));

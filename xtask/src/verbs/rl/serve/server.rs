@@ -10,11 +10,19 @@ use gump_rl::server::{Event, Server};
 use gump_rl::{EnvConfig, PreparedScenario, Sampling, TrafficSource};
 
 use super::Args;
+use crate::cli::WrongArguments;
 use crate::run::{Run, interrupted};
 use crate::verbs::rl::{PreparedSet, RlWorld};
 
 impl Args {
     pub(crate) fn execute(&self, run: &mut Run) -> anyhow::Result<()> {
+        if !(self.horizon > 0.0 && self.horizon.is_finite()) {
+            let wrong = format!(
+                "--horizon: expected a number above 0, found {}",
+                self.horizon
+            );
+            return Err(WrongArguments(wrong).into());
+        }
         let prepared = PreparedSet::read(run, &self.scenarios, Split::Train, self.limit)?.scenarios;
         let mut config = EnvConfig::default();
         let world = run.phase("load", |run| {
