@@ -49,11 +49,20 @@ class _Connection:
     """Frames to and from the server: a length, a kind, a body."""
 
     def __init__(self, path):
+        self._path = path
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self._socket.connect(path)
+        try:
+            self._socket.connect(path)
+        except OSError as error:
+            self._socket.close()
+            # Of the same class, with the path, which the socket's own error lacks.
+            raise OSError(error.errno, f"no server can be reached ({error.strerror})", str(path)) from None
 
     def tell(self, kind, body=b""):
-        self._socket.sendall(struct.pack("<IB", len(body), kind) + body)
+        try:
+            self._socket.sendall(struct.pack("<IB", len(body), kind) + body)
+        except (BrokenPipeError, ConnectionResetError):
+            raise ConnectionError(self._hung_up()) from None
 
     def ask(self, kind, body, expected):
         self.tell(kind, body)
@@ -72,11 +81,27 @@ class _Connection:
         data = bytearray(length)
         view, got = memoryview(data), 0
         while got < length:
-            n = self._socket.recv_into(view[got:])
+            try:
+                n = self._socket.recv_into(view[got:])
+            except ConnectionResetError:
+                n = 0
             if n == 0:
-                raise ConnectionError("the server hung up")
+                raise ConnectionError(self._hung_up())
             got += n
         return data
+
+    def _hung_up(self):
+        return f"the server at {self._path} has closed the connection: make another environment"
+
+
+def _shaped(values, dtype, shape, what):
+    """An array of this type; ValueError with both shapes if it has another one."""
+    array = np.ascontiguousarray(values, dtype)
+    # Arrays without an axis would get one above.
+    found = np.shape(values)
+    if found != shape:
+        raise ValueError(f"{what}: expected an array of shape {list(shape)}, found {list(found)}")
+    return array
 
 
 class _Body:
@@ -146,16 +171,16 @@ class GumpVectorEnv(_VectorBase):
             seeds = [self._draw(1)[0] if one is None else one for one in seed]
         body = struct.pack("B", (seeds is not None) | (mask is not None) << 1)
         if seeds is not None:
-            body += np.asarray(seeds, "<u8").tobytes()
+            body += _shaped(seeds, "<u8", (self.num_envs,), "seed").tobytes()
         if mask is not None:
-            body += np.asarray(mask, bool).tobytes()
+            body += _shaped(mask, bool, (self.num_envs,), "reset_mask").tobytes()
         answer = _Body(self._connection.ask(_RESET, body, _OBSERVATIONS))
         self._was_reset = True
         return self._observations(answer, self.num_envs), {}
 
     def step(self, actions):
-        """One action per row, `[num_envs, action_len]` in [-1, 1]."""
-        body = np.ascontiguousarray(actions, "<f4").tobytes()
+        """One action per row, `[num_envs, action_len]` in [-1, 1]; ValueError for another shape."""
+        body = _shaped(actions, "<f4", (self.num_envs, self.action_len), "actions").tobytes()
         answer = _Body(self._connection.ask(_STEP, body, _STEPPED))
         n = self.num_envs
         observations = self._observations(answer, n)
@@ -239,7 +264,8 @@ class GumpEnv(_Base):
 
     def step(self, action):
         """One action, `[action_len]` in [-1, 1]."""
-        observations, rewards, terminated, truncated, infos = self._rows.step(np.asarray(action)[None])
+        action = _shaped(action, "<f4", (self._rows.action_len,), "action")
+        observations, rewards, terminated, truncated, infos = self._rows.step(action[None])
         infos = {key: value[0] for key, value in infos.items() if not key.startswith("_")}
         return observations[0], float(rewards[0]), bool(terminated[0]), bool(truncated[0]), infos
 

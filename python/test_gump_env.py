@@ -115,8 +115,27 @@ class VectorEnv(unittest.TestCase):
                 env.step(np.full((2, 2), action))
             self.assertIn(what, str(refused.exception))
         env.step(np.zeros((2, 2)))
-        with self.assertRaises(GumpError):
-            env.step(np.zeros((3, 2)))
+
+    def test_arrays_of_another_shape_are_not_sent(self):
+        env = self.env(2)
+        with self.assertRaisesRegex(ValueError, r"^seed: expected an array of shape \[2\], found \[3\]$"):
+            env.reset(seed=[1, 2, 3])
+        env.reset(seed=0)
+        for shape in ((3, 2), (2, 3), (2,), (4,), ()):
+            found = f"expected an array of shape [2, 2], found {list(shape)}"
+            with self.assertRaises(ValueError) as refused:
+                env.step(np.zeros(shape))
+            self.assertEqual(str(refused.exception), f"actions: {found}")
+        with self.assertRaisesRegex(ValueError, "reset_mask"):
+            env.reset(options={"reset_mask": [True]})
+        # The server has heard of none of this.
+        env.step(np.zeros((2, 2)))
+
+    def test_a_server_that_is_not_there_is_named(self):
+        missing = SOCKET + ".missing"
+        with self.assertRaises(FileNotFoundError) as refused:
+            GumpVectorEnv(missing)
+        self.assertIn(missing, str(refused.exception))
 
     @without_gymnasium
     def test_it_is_a_gymnasium_vector_env(self):
@@ -150,6 +169,13 @@ class Env(unittest.TestCase):
                 self.assertGreater(infos["steps"], 0)
                 return
         self.fail("no end")
+
+    def test_an_action_of_another_shape_is_not_sent(self):
+        env = self.env()
+        env.reset(seed=0)
+        with self.assertRaisesRegex(ValueError, r"^action: expected an array of shape \[2\], found \[3\]$"):
+            env.step(np.zeros(3))
+        env.step(np.zeros(2))
 
     @without_gymnasium
     def test_gymnasiums_checker_is_content(self):
