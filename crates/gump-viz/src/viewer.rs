@@ -41,7 +41,7 @@ pub struct Viewer<'a> {
     futures: Vec<(String, &'a Rollout)>,
     metrics: Vec<MetricTrack>,
     heat: Vec<HeatMap>,
-    realism: BTreeMap<AgentId, f64>,
+    plausibility: BTreeMap<AgentId, f64>,
     deeds: BTreeMap<AgentId, String>,
     candidates: Vec<CandidatePath>,
     note: String,
@@ -64,7 +64,7 @@ impl<'a> Viewer<'a> {
             futures: Vec::new(),
             metrics: Vec::new(),
             heat: Vec::new(),
-            realism: BTreeMap::new(),
+            plausibility: BTreeMap::new(),
             deeds: BTreeMap::new(),
             candidates: Vec::new(),
             note: String::new(),
@@ -104,9 +104,10 @@ impl<'a> Viewer<'a> {
         self
     }
 
-    /// Sets how realistic an agent's futures are, 0 to 1, shown as a colour.
-    pub fn realism(&mut self, agent: AgentId, realism: f64) -> &mut Self {
-        self.realism.insert(agent, realism);
+    /// Sets how plausible an agent's futures are, 0 to 1, shown as a colour: its realism times the
+    /// share of futures without an implausible action.
+    pub fn realism(&mut self, agent: AgentId, plausibility: f64) -> &mut Self {
+        self.plausibility.insert(agent, plausibility);
         self
     }
 
@@ -179,7 +180,7 @@ impl<'a> Viewer<'a> {
                 "kind": a.kind.name(),
                 "length": rounded(a.length),
                 "width": rounded(a.width),
-                "realism": self.realism.get(&a.id).map(|&realism| rounded(realism)),
+                "plausibility": self.plausibility.get(&a.id).map(|&share| rounded(share)),
                 "deeds": self.deeds.get(&a.id).filter(|words| !words.is_empty()),
             })).collect::<Vec<_>>(),
             "lights": lights.iter().map(|&(_, at)| local(at)).collect::<Vec<_>>(),

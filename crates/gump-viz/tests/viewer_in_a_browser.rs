@@ -197,8 +197,8 @@ fn the_viewer_plays_and_switches_in_a_browser() {
         ahead_s: 0.5,
         draws: (0..64).map(draw).collect(),
     });
-    for (id, realism) in [(0, 0.9), (7, 0.4), (9, 0.1)] {
-        viewer.realism(AgentId(id), realism);
+    for (id, plausibility) in [(0, 0.9), (7, 0.4), (9, 0.1)] {
+        viewer.realism(AgentId(id), plausibility);
     }
     for (name, score) in [("slow ahead", Some(0.25)), ("fast", None)] {
         viewer.candidate(CandidatePath {
@@ -237,6 +237,7 @@ fn the_viewer_plays_and_switches_in_a_browser() {
             changes.len() == 11 && changes.values().all(|changed| *changed == true),
             "{report}"
         );
+        assert_eq!(report["overlay_fits_its_pane"], true);
         let heat = report["heat"].as_array().expect("a number per canvas");
         let is_drawn = |inked: &Value| inked.as_u64().is_some_and(|n| n > 100);
         assert!(heat.len() == 3 && heat.iter().all(is_drawn), "{report}");
@@ -244,7 +245,7 @@ fn the_viewer_plays_and_switches_in_a_browser() {
             (&report["heat_on_road"], &report["heat_elsewhere"]),
             (&true.into(), &false.into())
         );
-        let colours = serde_json::json!([["class", "speed", "realism"], 3]);
+        let colours = serde_json::json!([["class", "speed", "plausibility"], 3]);
         assert_eq!(report["colours"], colours);
         // Speed, heading, distance from the log and the metric given.
         assert_eq!(

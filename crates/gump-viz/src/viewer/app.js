@@ -51,7 +51,7 @@ function enter(k) {
   // What is shown stays, where this scene has it too.
   if (ui.shown === 'all' ? n < 2 : ui.shown > n) ui.shown = Math.min(n, 1);
   Object.assign(ui, { t: 0, selected: -1, hovered: -1, left: null, candidate: -1, ends: [] });
-  ways = ['class', 'speed', ...(facts.agents.some(agent => agent.realism !== null) ? ['realism'] : [])];
+  ways = ['class', 'speed', ...(facts.agents.some(agent => agent.plausibility !== null) ? ['plausibility'] : [])];
   if (!ways.includes(ui.colour)) ui.colour = 'class';
   Object.assign($('time'), { min: span[0], max: span[1], step: 'any', value: 0 });
   $('present').style.left = `${100 * (0 - span[0]) / Math.max(span[1] - span[0], 1e-9)}%`;
@@ -305,7 +305,7 @@ function dressLegend() {
     const bar = document.createElement('i');
     bar.className = 'ramp';
     bar.style.background = `linear-gradient(90deg, ${RAMP[ui.dark ? 'dark' : 'light'].join(',')})`;
-    const [low, high] = ui.colour === 'speed' ? ['0', `${FAST} m/s`] : [`realism \u2264 ${UNLIKE}`, '1'];
+    const [low, high] = ui.colour === 'speed' ? ['0', `${FAST} m/s`] : [`plausibility \u2264 ${UNLIKELY}`, '1'];
     const ego = document.createElement('span'), rim = document.createElement('i');
     rim.style.cssText = `background: none; border: 3px solid ${colours().ego}`;
     ego.append(rim, 'ego');
@@ -398,12 +398,12 @@ function drawHeatPanel() {
 function drawAgentPanel() {
   if (ui.selected < 0) return;
   drawHeatPanel();
-  const take = heatTake(ui, world), s = stateAt(world, take, ui.selected, ui.t), { length, width, realism, deeds } = facts.agents[ui.selected];
+  const take = heatTake(ui, world), s = stateAt(world, take, ui.selected, ui.t), { length, width, plausibility, deeds } = facts.agents[ui.selected];
   const degrees = h => ((h * 180 / Math.PI) % 360 + 540) % 360 - 180;
   const rows = s ? [
     ['speed', `${s.speed.toFixed(1)} m/s, ${(s.speed * 3.6).toFixed(0)} km/h`], ['heading', `${degrees(s.heading).toFixed(0)}\u00b0`],
     ['position', `${(s.x + facts.origin[0]).toFixed(1)}, ${(s.y + facts.origin[1]).toFixed(1)} m`], ['size', `${length.toFixed(1)} \u00d7 ${width.toFixed(1)} m`],
-    ...(realism === null ? [] : [['realism', `${realism.toFixed(2)} of 1`]]),
+    ...(plausibility === null ? [] : [['plausibility', `${plausibility.toFixed(2)} of 1`]]),
     ...(deeds === null ? [] : [['implausible', deeds]]),
   ] : [['', 'not there at this time']];
   $('state').replaceChildren(...rows.flatMap(([name, value]) => {
@@ -546,9 +546,9 @@ function drawTip() {
   const s = a < 0 ? null : stateAt(world, take, a, ui.t);
   tip.hidden = !s;
   if (!s) return;
-  const { realism } = facts.agents[a], title = document.createElement('b');
+  const { plausibility } = facts.agents[a], title = document.createElement('b');
   title.textContent = agentName(a);
-  const lines = [`${s.speed.toFixed(1)} m/s, ${ui.t < 0 || take === 0 ? 'recorded' : takeName(world, take)}`, ...(realism === null ? [] : [`realism ${realism.toFixed(2)}`])];
+  const lines = [`${s.speed.toFixed(1)} m/s, ${ui.t < 0 || take === 0 ? 'recorded' : takeName(world, take)}`, ...(plausibility === null ? [] : [`plausibility ${plausibility.toFixed(2)}`])];
   tip.replaceChildren(title, lines.join(', '));
   if (a === ui.selected && matchMedia('(max-width: 46rem)').matches) {
     const link = document.createElement('a');
@@ -579,7 +579,7 @@ function buildMarks() {
     [has('bump'), 'speed bump', box(c.yellowLine, 'opacity="0.5"')],
     [has('stopLine'), 'stop line', box(c.road) + line(c.whiteLine, 'stroke-width="4"')],
     [has('stopSign'), 'stop sign', `<path d="M9 2h6l4 4v3l-4 4h-6l-4-4v-3z" fill="${c.red}"/>`],
-    [facts.lights.length, 'traffic light', spot(c.red)],
+    [facts.lights.length, 'traffic light', [c.red, c.yellow, c.green].map((fill, i) => `<circle cx="${4 + 8 * i}" cy="7" r="3" fill="${fill}" stroke="${c.outline}" stroke-width="1.2"/>`).join('')],
     [true, 'ego (outlined)', box('none', `stroke="${c.ego}" stroke-width="3"`)],
     [true, 'front', `<path d="M8 3l10 4-10 4z" fill="${c.text}" opacity="0.7"/>`],
     [true, 'chosen agent', box('none', `stroke="${c.text}" stroke-width="1.6"`)],

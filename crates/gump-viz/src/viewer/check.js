@@ -27,6 +27,12 @@ if (location.hash === '#check') {
     report.ends = world.takes.map((take, k) => state(k, facts.ego, take.first + (take.frames - 1) * take.dt));
     const changes = keys => { const before = picture(); keys.forEach(press); return picture() !== before; };
     report.changes = { all: changes(['a']), colour: changes(['c']), ego: changes(['e']), follow: changes(['f', 'Home']), up: changes(['u']), heading: changes(['h']), trails: changes(['l', 't']), beside: changes(['b']), alone: changes(['b', 'l']), zoom: changes(['+']), fit: changes(['0']) };
+    // All futures in one pane, then in one of two: the lines that are kept are those of the new pane.
+    const kept_alike = () => { const kept = picture(); scene.overlay.key = ''; return picture() === kept; };
+    seek(0); show('all'); paint(); press('b');
+    report.overlay_fits_its_pane = kept_alike();
+    press('b'); show('all');
+    report.overlay_fits_its_pane &&= kept_alike();
     seek(0); show(1); choose(facts.ego); paint();
     // Heat in the panel and on the road; none of another future.
     const inked = canvas => { const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height); let n = 0; for (let i = 3; i < data.length; i += 4) n += data[i] > 0; return n; };

@@ -3,7 +3,7 @@
 
 const LIGHTS = [null, 'green', 'yellow', 'red', 'other'];
 const FAST = 20; // m/s, the end of the scale of speeds
-const UNLIKE = 0.5; // the start of the scale of realism, which few agents fall below
+const UNLIKELY = 0.5; // the start of the scale of plausibility, which few agents fall below
 
 // Slow to fast; luminance rises, so that it reads without colour too.
 const RAMP = {
@@ -21,10 +21,10 @@ function rampColour(stops, share) {
 
 const scaled = (share, dark) => `rgb(${rampColour(RAMP[dark ? 'dark' : 'light'], share).join(',')})`;
 
-// By class, by speed or by realism, as is chosen; what has no such number is grey.
+// By class, by speed or by plausibility, as is chosen; what has no such number is grey.
 function agentColour(ui, agent, speed, colours) {
-  const { kind, realism } = facts.agents[agent];
-  if (ui.colour === 'realism') return realism === null ? colours.other : scaled((realism - UNLIKE) / (1 - UNLIKE), ui.dark);
+  const { kind, plausibility } = facts.agents[agent];
+  if (ui.colour === 'plausibility') return plausibility === null ? colours.other : scaled((plausibility - UNLIKELY) / (1 - UNLIKELY), ui.dark);
   if (ui.colour === 'speed' && ['vehicle', 'pedestrian', 'bicycle'].includes(kind)) return scaled(speed / FAST, ui.dark);
   return kindColour(agent, colours);
 }
@@ -165,7 +165,8 @@ class Scene {
   // All futures over one another, kept until camera or theme change.
   drawOverlay(ui, colours) {
     const { overlay, canvas } = this, { x, y, scale, angle } = this.camera;
-    const key = [this.left, x, y, scale, angle, canvas.width, canvas.height, ui.dark, ui.selected, ui.colour].join();
+    // The width is that of a pane: with two panes of the canvas the middle of the first moves left.
+    const key = [this.left, this.width, x, y, scale, angle, canvas.width, canvas.height, ui.dark, ui.selected, ui.colour].join();
     if (overlay.key !== key) {
       overlay.key = key;
       Object.assign(overlay.canvas, { width: canvas.width, height: canvas.height });
@@ -176,7 +177,7 @@ class Scene {
       const fade = Math.max(0.06, 0.6 / Math.sqrt(this.overlayPaths.length));
       for (const paths of this.overlayPaths) paths.forEach((entry, a) => {
         if (!entry) return;
-        c.strokeStyle = ui.colour === 'realism' ? agentColour(ui, a, 0, colours) : kindColour(a, colours);
+        c.strokeStyle = ui.colour === 'plausibility' ? agentColour(ui, a, 0, colours) : kindColour(a, colours);
         c.globalAlpha = ui.selected < 0 || a === ui.selected ? fade * (a === ui.selected ? 2 : 1) : fade * 0.35;
         c.lineWidth = this.px(0.3, a === facts.ego || a === ui.selected ? 1.6 : 1.1);
         c.stroke(entry);
