@@ -8,12 +8,12 @@ export const PALETTES = {
   light: {
     ground: '#f6f5f2', road: '#dfe1e4', route: '#f3e0ba', crosswalk: '#fafaf8', direction: '#c0c5cc', whiteLine: '#ffffff',
     yellowLine: '#e3c155', edge: '#9ca3ad', text: '#3a3f47', ego: '#e69f00', vehicle: '#0072b2', pedestrian: '#cc79a7',
-    bicycle: '#009e73', other: '#8b9099', outline: '#232830', wedge: '#ffffff', red: '#d55e00', yellow: '#f0e442', green: '#009e73',
+    bicycle: '#009e73', other: '#8b9099', outline: '#232830', wedge: '#ffffff', red: '#d55e00', yellow: '#f0e442', green: '#35e06e',
   },
   dark: {
     ground: '#111317', road: '#24282f', route: '#453922', crosswalk: '#565d68', direction: '#3c434d', whiteLine: '#78808b',
     yellowLine: '#97833d', edge: '#5b636f', text: '#c5cbd3', ego: '#e69f00', vehicle: '#56b4e9', pedestrian: '#cc79a7',
-    bicycle: '#009e73', other: '#7c828c', outline: '#0b0d10', wedge: '#0b0d10', red: '#d55e00', yellow: '#f0e442', green: '#009e73',
+    bicycle: '#009e73', other: '#7c828c', outline: '#0b0d10', wedge: '#0b0d10', red: '#d55e00', yellow: '#f0e442', green: '#35e06e',
   },
 };
 

@@ -6,7 +6,7 @@ use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
 use crate::plot::{COLOURS, Plot, TEXT, font, tick};
-use crate::{Picture, Theme, VizError};
+use crate::{Picture, Theme, VizError, text_layout};
 
 /// Horizontal bars in groups, so that long names can be read.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -45,8 +45,13 @@ const WIDTH: u32 = 760;
 /// Height of a bar, and of the gap between groups, pixels.
 const BAR: f64 = 11.0;
 const GAP: f64 = 9.0;
-/// Height of what is not bars: margins and the axis below, pixels.
-const FRAME: u32 = 76;
+/// Height of what is not bars: margins and the axis below without its title, pixels.
+const FRAME: u32 = 58;
+/// Size of the title of the axis, and the height of each of its lines, pixels.
+const AXIS_TITLE: f64 = 13.5;
+const LINE: u32 = 18;
+/// Space to the left and right of it, pixels.
+const MARGIN: f64 = 12.0;
 /// Height of the title and of the legend, pixels.
 const TITLE: u32 = 30;
 const LEGEND: u32 = 26;
@@ -114,24 +119,28 @@ impl Bars {
             self.draw_legend(&head)?;
             area = rest;
         }
+        let label = self.label_lines();
+        let height = area.dim_in_pixel().1 - LINE * label.len() as u32;
+        let (area, below) = area.split_vertically(height);
         let longest = self.groups.iter().map(|group| group.name.chars().count());
         let names = longest.max().unwrap_or(0) as i32 * LETTER + 16;
+        let names = names.clamp(40, WIDTH as i32 / 2);
         let n = self.groups.len();
+        let middle = (MARGIN + f64::from(names) + f64::from(WIDTH) - 2.0 * MARGIN) / 2.0;
+        draw_label(&below, &label, middle)?;
         let mut chart = ChartBuilder::on(&area)
             .margin(12)
             .margin_right(24)
-            .x_label_area_size(46)
-            .y_label_area_size(names.clamp(40, WIDTH as i32 / 2))
+            .x_label_area_size(28)
+            .y_label_area_size(names)
             .build_cartesian_2d(low..high, n as f64 + 0.5..0.5)?;
         chart
             .configure_mesh()
-            .x_desc(self.label.as_str())
             .x_labels(8)
             .y_labels(2 * n + 1)
             .x_label_formatter(&|v| tick(*v))
             .y_label_formatter(&|v| self.name_at(*v))
             .label_style(font(13.0))
-            .axis_desc_style(font(13.5))
             .axis_style(TEXT.mix(0.45))
             .bold_line_style(TEXT.mix(0.12))
             .light_line_style(TEXT.mix(0.0))
@@ -181,6 +190,21 @@ impl Bars {
         Ok(())
     }
 
+    /// The title of the horizontal axis in as many lines as the width of the drawing demands.
+    fn label_lines(&self) -> Vec<String> {
+        let mut lines: Vec<String> = Vec::new();
+        for word in self.label.split_whitespace() {
+            match lines.last_mut() {
+                Some(line) if label_width(&format!("{line} {word}")) <= WIDEST => {
+                    *line += " ";
+                    *line += word;
+                }
+                _ => lines.push(word.to_owned()),
+            }
+        }
+        lines
+    }
+
     /// Returns the label at a place of the vertical axis.
     fn name_at(&self, y: f64) -> String {
         let is_whole = (y - y.round()).abs() < 1e-6 && y >= 1.0;
@@ -192,12 +216,38 @@ impl Bars {
     }
 }
 
+/// Greatest width of a line of the title of the axis, pixels.
+const WIDEST: f64 = WIDTH as f64 - 2.0 * MARGIN;
+
+/// Width of a line of the title of the axis as pixels draw it, which the fonts of SVG stay below.
+fn label_width(line: &str) -> f64 {
+    text_layout::width(line, AXIS_TITLE * 0.7)
+}
+
+/// Draws the title of the axis around `middle`, moved so that it does not run off an edge.
+fn draw_label<B: DrawingBackend>(
+    area: &DrawingArea<B, plotters::coord::Shift>,
+    lines: &[String],
+    middle: f64,
+) -> Result<(), DrawingAreaErrorKind<B::ErrorType>> {
+    for (i, line) in lines.iter().enumerate() {
+        let half = label_width(line) / 2.0;
+        let most = f64::from(WIDTH) - MARGIN - half;
+        let x = middle.min(most).max(MARGIN + half);
+        let y = LINE as i32 * i as i32 + LINE as i32 / 3;
+        let style = font(AXIS_TITLE).pos(Pos::new(HPos::Center, VPos::Center));
+        area.draw(&Text::new(line.as_str(), (x as i32, y), style))?;
+    }
+    Ok(())
+}
+
 impl Plot for Bars {
     fn size(&self) -> (u32, u32) {
         let rows = (self.groups.len() as f64 * self.group_px()).ceil() as u32;
         let title = if self.title.is_empty() { 0 } else { TITLE };
         let legend = if self.series.len() > 1 { LEGEND } else { 0 };
-        (WIDTH, rows + FRAME + title + legend)
+        let label = LINE * self.label_lines().len() as u32;
+        (WIDTH, rows + FRAME + label + title + legend)
     }
 
     fn draw_on<B: DrawingBackend>(&self, backend: B) -> Result<(), VizError> {
@@ -288,6 +338,32 @@ mod tests {
         let (short, long) = (lengths[0], lengths[lengths.len() - 1]);
         let ratio = long as f64 / short as f64;
         assert!((ratio - 0.9 / 0.4).abs() < 0.1, "{ratio}");
+    }
+
+    #[test]
+    fn long_titles_of_the_axis_stay_in_the_drawing() {
+        let text = "speed of the slowest of all vehicles, metres per second, with 95 % intervals \
+                    over scenarios";
+        let ink = Theme::Light.colours().text;
+        let is_ink = |pixel: &[u8]| pixel[..3] == ink;
+        for n in [1, 3] {
+            let mut bars = scores();
+            bars.groups[0].name = "a name as long as that of many a row".into();
+            bars.label = [text; 3][..n].join(" ");
+            let lines = bars.label_lines();
+            assert_eq!(lines.join(" "), bars.label);
+            assert!(lines.len() >= n && lines.iter().all(|line| label_width(line) <= WIDEST));
+            let picture = bars.to_picture(Theme::Light).unwrap();
+            let rows = picture.rgba.chunks_exact(4 * picture.width);
+            let margin = 4 * MARGIN as usize;
+            for row in rows {
+                let (left, right) = (&row[..margin], &row[row.len() - margin..]);
+                let outside = left.chunks_exact(4).chain(right.chunks_exact(4));
+                assert_eq!(outside.filter(|pixel| is_ink(pixel)).count(), 0);
+            }
+            let svg = bars.to_svg().unwrap();
+            assert!(lines.iter().all(|line| svg.contains(line.as_str())));
+        }
     }
 
     #[test]

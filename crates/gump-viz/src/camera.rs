@@ -135,6 +135,13 @@ impl Camera {
         middle - dvec2(local.y, local.x) * self.scale()
     }
 
+    /// Whether a world point is in the picture.
+    pub(crate) fn sees(&self, point: DVec2) -> bool {
+        let pixel = self.pixel(point);
+        let is_in = |at: f64, size: u32| (0.0..=f64::from(size)).contains(&at);
+        is_in(pixel.x, self.width_px) && is_in(pixel.y, self.height_px)
+    }
+
     /// False if nothing within `radius` metres of `point` is in view.
     pub(crate) fn may_see(&self, point: DVec2, radius: f64) -> bool {
         let half = f64::from(self.width_px).hypot(f64::from(self.height_px)) / 2.0 / self.scale();

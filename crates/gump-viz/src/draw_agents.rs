@@ -3,7 +3,7 @@
 //! Shapes of one colour are gathered into one path each, which keeps films fast.
 
 use gump_geometry::{DVec2, OrientedBox, Pose, dvec2};
-use gump_scene::{Agent, AgentId, AgentKind, Frame, MapGraph};
+use gump_scene::{Agent, AgentId, AgentKind, Frame, LightState, MapGraph};
 
 use crate::pen::{Pen, Shape};
 use crate::theme::{Colours, Rgb};
@@ -187,20 +187,28 @@ fn draw_trails<F: std::borrow::Borrow<Frame>>(
 /// Draws each light as a dot where vehicles stop for it.
 pub(crate) fn draw_lights(pen: &mut Pen<'_>, frame: &Frame, map: &MapGraph, colours: &Colours) {
     let radius = pen.px(0.55, 1.5).min(8.0);
-    for light in frame.lights() {
-        let start = || map.lane(light.lane).map(|lane| lane.centerline.points()[0]);
-        let Some(at) = light.stop_point.or_else(start) else {
-            continue;
-        };
+    for (at, state) in places_of_lights(frame, map) {
         if pen.camera.may_see(at, 2.0) {
             let mut ring = Shape::new(&pen.camera);
             ring.disc(at, radius * 1.4);
             pen.fill(ring, colours.outline, 0.9);
             let mut dot = Shape::new(&pen.camera);
             dot.disc(at, radius);
-            pen.fill(dot, colours.light(light.state), 1.0);
+            pen.fill(dot, colours.light(state), 1.0);
         }
     }
+}
+
+/// Where vehicles stop for each light, and its state; lights on lanes that the map lacks are left
+/// out.
+pub(crate) fn places_of_lights(
+    frame: &Frame,
+    map: &MapGraph,
+) -> impl Iterator<Item = (DVec2, LightState)> {
+    frame.lights().iter().filter_map(|light| {
+        let start = || map.lane(light.lane).map(|lane| lane.centerline.points()[0]);
+        Some((light.stop_point.or_else(start)?, light.state))
+    })
 }
 
 fn is_seen(pen: &Pen<'_>, agent: &Agent) -> bool {

@@ -42,6 +42,7 @@ mod error;
 mod files;
 mod film;
 mod indexed;
+mod legend;
 mod page;
 mod pen;
 mod picture;

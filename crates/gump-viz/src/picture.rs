@@ -11,6 +11,7 @@ use tiny_skia::{Pixmap, Transform};
 use crate::draw_agents::{draw_agents, draw_lights, draw_past, draw_trails_of_futures};
 use crate::draw_map::draw_backdrop;
 use crate::files::write_whole;
+use crate::legend::{self, Entry, Mark, draw_legend};
 use crate::pen::{Pen, Shape, paint};
 use crate::theme::{Colours, Rgb, mix};
 use crate::{Camera, CandidatePath, Theme, VizError, text_layout};
@@ -26,7 +27,8 @@ pub struct PictureSpec {
     pub past_s: f64,
     /// Whether to draw a bar of a round number of metres, bottom left.
     pub scale_bar: bool,
-    /// Whether to name the colours, bottom right.
+    /// Whether to name colours and lines, bottom right, and to say how many agents are in view if
+    /// not all are.
     pub legend: bool,
     /// Label for the top left corner; empty for none.
     pub label: String,
@@ -92,16 +94,29 @@ pub fn draw_futures(scene: &SceneState<'_>, futures: &[&[Frame]], spec: &Picture
     let past = recent(scene.history, spec.past_s, scene.dt);
     draw_past(&mut pen, past, scene.ego, colours, 8);
     draw_agents(&mut pen, scene.now(), scene.ego, colours, 1.0);
-    finish(&mut pixmap, spec, colours)
+    let mut entries = legend::of_scene(scene, spec, colours);
+    match futures.len() {
+        0 => {}
+        n => {
+            let text = if n == 1 { "future" } else { "futures" };
+            entries.push(Entry::new(text, Mark::Line(colours.vehicle, 0.75)));
+        }
+    }
+    finish(&mut pixmap, spec, &entries, colours)
 }
 
-/// Adds what lies over the scene.
-fn finish(pixmap: &mut Pixmap, spec: &PictureSpec, colours: &Colours) -> Picture {
+/// Adds what lies over the scene; `entries` are those of the legend.
+fn finish(
+    pixmap: &mut Pixmap,
+    spec: &PictureSpec,
+    entries: &[Entry],
+    colours: &Colours,
+) -> Picture {
     if spec.scale_bar {
         draw_scale_bar(pixmap, spec.camera.scale(), colours);
     }
     if spec.legend {
-        draw_legend(pixmap, colours);
+        draw_legend(pixmap, entries, colours);
     }
     draw_label(pixmap, &spec.label, colours);
     Picture::from_pixmap(pixmap)
@@ -143,7 +158,15 @@ pub fn draw_candidates(
         }
     }
     draw_agents(&mut pen, scene.now(), scene.ego, colours, 1.0);
-    finish(&mut pixmap, spec, colours)
+    let mut entries = legend::of_scene(scene, spec, colours);
+    if n_others < candidates.len() {
+        entries.push(Entry::new("chosen path", Mark::Line(colours.ego, 1.0)));
+    }
+    if n_others > 0 {
+        let mark = Mark::Line(colours.text, faint.max(0.5));
+        entries.push(Entry::new("other candidates", mark));
+    }
+    finish(&mut pixmap, spec, &entries, colours)
 }
 
 /// Draws one layer of a raster, each value a square of `zoom` pixels: 0 is the ground, 1 the
@@ -276,27 +299,6 @@ fn round_length(metres: f64) -> f64 {
     magnitude * round.unwrap_or(1.0)
 }
 
-fn draw_legend(pixmap: &mut Pixmap, colours: &Colours) {
-    let entries: [(&str, Rgb); 4] = [
-        ("ego", colours.ego),
-        ("vehicle", colours.vehicle),
-        ("pedestrian", colours.pedestrian),
-        ("bicycle", colours.bicycle),
-    ];
-    let size = (f64::from(pixmap.width()) / 60.0).clamp(6.0, 11.0);
-    let advance = |text: &str| text_layout::width(text, size) + size * 3.0;
-    let total: f64 = entries.iter().map(|(text, _)| advance(text)).sum();
-    let (right, bottom) = (f64::from(pixmap.width()), f64::from(pixmap.height()));
-    let (mut x, baseline) = (right - total, bottom - size * 1.2);
-    let patch = (total + size, size * 4.0);
-    draw_patch(pixmap, (x - size, baseline - size * 1.9), patch, colours);
-    for (text, colour) in entries {
-        draw_rectangle(pixmap, (x, baseline - size), (size, size), colour, 1.0);
-        text_layout::write(pixmap, text, (x + size * 1.5, baseline), size, colours.text);
-        x += advance(text);
-    }
-}
-
 /// Draws the label in the top left corner.
 pub(crate) fn draw_label(pixmap: &mut Pixmap, label: &str, colours: &Colours) {
     if label.is_empty() {
@@ -311,7 +313,12 @@ pub(crate) fn draw_label(pixmap: &mut Pixmap, label: &str, colours: &Colours) {
 }
 
 /// A piece of ground under words, so that they can be read over anything.
-fn draw_patch(pixmap: &mut Pixmap, corner: (f64, f64), size: (f64, f64), colours: &Colours) {
+pub(crate) fn draw_patch(
+    pixmap: &mut Pixmap,
+    corner: (f64, f64),
+    size: (f64, f64),
+    colours: &Colours,
+) {
     draw_rectangle(pixmap, corner, size, colours.ground, 0.8);
 }
 

@@ -39,6 +39,7 @@ pub(crate) struct Colours {
     pub(crate) wedge: Rgb,
     pub(crate) red: Rgb,
     pub(crate) yellow: Rgb,
+    /// Of lights; not the green of bicycles.
     pub(crate) green: Rgb,
 }
 
@@ -61,7 +62,7 @@ const LIGHT: Colours = Colours {
     wedge: [0xFF, 0xFF, 0xFF],
     red: [0xD5, 0x5E, 0x00],
     yellow: [0xF0, 0xE4, 0x42],
-    green: [0x00, 0x9E, 0x73],
+    green: [0x35, 0xE0, 0x6E],
 };
 
 const DARK: Colours = Colours {
@@ -83,7 +84,7 @@ const DARK: Colours = Colours {
     wedge: [0x0B, 0x0D, 0x10],
     red: [0xD5, 0x5E, 0x00],
     yellow: [0xF0, 0xE4, 0x42],
-    green: [0x00, 0x9E, 0x73],
+    green: [0x35, 0xE0, 0x6E],
 };
 
 impl Theme {
@@ -146,4 +147,31 @@ impl Colours {
 /// The colour a fraction `t` of the way from `a` to `b`.
 pub(crate) fn mix(a: Rgb, b: Rgb, t: f32) -> Rgb {
     std::array::from_fn(|i| (f32::from(a[i]) * (1.0 - t) + f32::from(b[i]) * t).round() as u8)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lights_do_not_look_like_agents() {
+        for theme in [Theme::Light, Theme::Dark] {
+            let colours = theme.colours();
+            let agents = [
+                colours.ego,
+                colours.vehicle,
+                colours.pedestrian,
+                colours.bicycle,
+                colours.other,
+            ];
+            for light in [colours.red, colours.yellow, colours.green] {
+                for agent in agents {
+                    let apart: u32 = (0..3)
+                        .map(|i| u32::from(light[i].abs_diff(agent[i])).pow(2))
+                        .sum();
+                    assert!(apart > 60 * 60, "{light:?} and {agent:?}");
+                }
+            }
+        }
+    }
 }
