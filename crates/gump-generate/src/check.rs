@@ -1,4 +1,5 @@
-//! Check of a scene against its request, clause by clause.
+//! Check of a scene against its request, clause by clause. The clauses of constraints on single
+//! objects are in `object_check`.
 
 use std::fmt;
 
@@ -6,6 +7,7 @@ use gump_metrics::{Metric as _, OffRoad, overlapping, tags};
 use gump_scene::{AgentKind, Frame, Scenario, ScenarioTag, SceneState};
 
 use crate::Counts;
+pub use crate::object_check::check_objects;
 
 /// Sampling interval of futures, seconds: a step of the networks. Contacts in between are missed.
 pub(crate) const LOOK_S: f64 = 0.5;
@@ -32,7 +34,7 @@ pub struct Clause {
 }
 
 impl Clause {
-    fn new(clause: String, holds: Option<bool>) -> Self {
+    pub(crate) fn new(clause: String, holds: Option<bool>) -> Self {
         Self {
             clause,
             holds,

@@ -44,6 +44,7 @@ pub mod constraint;
 mod drive;
 mod futures;
 mod latin_hypercube;
+mod object_check;
 mod partial_scene;
 pub mod pipeline;
 mod prepared;

@@ -10,15 +10,24 @@ use gump_engine::placement::network::PlacementScorer;
 use gump_engine::placement::object_spec::{Bounds, ObjectSpec, agent_of};
 use gump_engine::placement::places::{PlacedVehicle, Places, Traffic};
 use gump_engine::placement::rules::{PlaceDraw, Rules};
-use gump_geometry::OrientedBox;
+use gump_geometry::{DVec2, OrientedBox, Pose};
 use gump_model::decoder::{STATE_STEPS, STEPS};
 use gump_scene::{Agent, AgentId, AgentKind, Frame, Seed};
-use gump_tokenizer::{AGENT_KEYS, Key, QuantizedState, TokenAgent, class_index};
+use gump_tokenizer::{AGENT_KEYS, Field, Key, QuantizedState, TokenAgent, class_index};
 use rand::seq::SliceRandom;
 
 use crate::constraint::EGO;
 use crate::prepared::Prepared;
 use crate::{GenerateError, GeneratedScene, latin_hypercube};
+
+/// A velocity within bounds of the speed. Vehicles and bicycles move where they face: the grid of
+/// velocities is too coarse for the direction of slow ones.
+fn bounded(velocity: DVec2, bounds: Bounds, kind: AgentKind, pose: Pose) -> DVec2 {
+    let speed = velocity.length().clamp(bounds.low, bounds.high);
+    let walks = kind == AgentKind::Pedestrian;
+    let way = velocity.try_normalize().filter(|_| walks);
+    way.unwrap_or_else(|| pose.direction()) * speed
+}
 
 /// One scene during generation.
 pub(crate) struct PartialScene<'a> {
@@ -202,7 +211,7 @@ impl<'a> PartialScene<'a> {
     }
 
     /// Adds an object, with its box as [`Rules::outline`] computes it.
-    pub(super) fn accept(&mut self, key: Key, state: QuantizedState, outline: OrientedBox) {
+    pub(super) fn accept(&mut self, key: Key, mut state: QuantizedState, outline: OrientedBox) {
         if !key.is_ego()
             && self
                 .wished
@@ -214,8 +223,25 @@ impl<'a> PartialScene<'a> {
         } else if key.is_ego() {
             self.named.insert(EGO.to_owned(), 0);
         }
+        // Later objects see the velocity that the scene will have.
+        let is_given = key.is_ego() && self.prepared.request.ego.velocity.is_some();
+        if let Some(bounds) = self.speed(self.agents.len()).filter(|_| !is_given) {
+            let velocity = bounded(state.velocity(), bounds, key.kind, outline.pose);
+            for (field, value) in [
+                (Field::VelocityX, velocity.x),
+                (Field::VelocityY, velocity.y),
+            ] {
+                state.set(field, field.quantize(value).bin);
+            }
+        }
         self.agents.push(TokenAgent { key, state });
         self.boxes.push(outline);
+    }
+
+    /// The speed that is asked of the object at an index.
+    fn speed(&self, i: usize) -> Option<Bounds> {
+        let is_named = |object: &&ObjectSpec| self.named.get(&object.id) == Some(&i);
+        self.prepared.objects.iter().find(is_named)?.speed
     }
 
     /// Starts again, or gives up with the most frequent violation.
@@ -244,8 +270,8 @@ impl<'a> PartialScene<'a> {
         }));
     }
 
-    pub(crate) fn finish(self) -> Result<GeneratedScene, GenerateError> {
-        self.outcome.unwrap_or(Ok(()))?;
+    pub(crate) fn finish(mut self) -> Result<GeneratedScene, GenerateError> {
+        self.outcome.take().unwrap_or(Ok(()))?;
         let Prepared { request, scene, .. } = self.prepared;
         let world_from_scene = scene.world_from_scene;
         let to_world = |(i, token): (usize, &TokenAgent)| {
@@ -254,10 +280,15 @@ impl<'a> PartialScene<'a> {
             state.pose = world_from_scene * own.pose;
             state.velocity = world_from_scene.rotate(state.velocity);
             let mut size = [own.length, own.width];
+            // What is given is kept exactly, not to the grid.
             if i == 0 {
-                // What is given is kept exactly, not to the grid.
                 size = [request.ego.length, request.ego.width];
                 state.pose = request.ego.pose;
+            }
+            if let Some(bounds) = self.speed(i) {
+                state.velocity = bounded(state.velocity, bounds, token.key.kind, state.pose);
+            }
+            if i == 0 {
                 state.velocity = request.ego.velocity.unwrap_or(state.velocity);
             }
             agent_of(AgentId(i as i64), token.key.kind, size, state, &request.map)

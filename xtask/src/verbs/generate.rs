@@ -10,7 +10,7 @@ use gump_engine::placement::object_spec::ObjectSpec;
 use gump_engine::{LightSource, SamplingConfig, TransformerWorld};
 use gump_eval::Notes;
 use gump_eval::worlds::{self, World, WorldName};
-use gump_generate::check::{off_road, overlaps};
+use gump_generate::check::{check_objects, off_road, overlaps};
 use gump_generate::constraint::parse_constraints;
 use gump_generate::pipeline::{CheckedScene, GenerationJob, GenerationWorlds, make_many};
 use gump_generate::{Counts, GenerateConfig, GenerateError, GenerateRequest, Placement};
@@ -43,7 +43,8 @@ pub(crate) struct Args {
     /// PATH, PATH#INDEX or PATH#SCENARIO_ID
     #[arg(long, value_name = "S")]
     map: String,
-    /// Kind of situation: one of nuPlan's 73 scenario tags, may be given up to four times
+    /// Kind of situation: one of nuPlan's 73 scenario tags, may be given up to four times; the
+    /// guide lists them (docs/guide/src/scenario-tags.md)
     #[arg(long, value_name = "TAG")]
     prompt: Vec<String>,
     /// Vehicles besides the ego; with no number given the model decides
@@ -239,7 +240,11 @@ impl Args {
             let numbers = first..(first + batch).min(n);
             let wrong = |error| self.wrong_request(error);
             for checked in make_many(worlds, order, numbers, run.seed()).map_err(wrong)? {
-                all.push(checked.map_err(wrong)?);
+                let mut checked = checked.map_err(wrong)?;
+                let request = &order.request;
+                let wishes = check_objects(&checked.scene, &request.map, &request.objects);
+                checked.clauses.extend(wishes);
+                all.push(checked);
                 progress.advance(1);
             }
         }
