@@ -282,7 +282,7 @@ mod tests {
         ];
         assert_eq!(texts(&scenario, 24.0), cropped);
         let bare = fixture::scenario("ego vehicle 0: 0,0").unwrap();
-        assert_eq!(texts(&bare, 24.0), ["ego"]);
+        assert_eq!(texts(&bare, 24.0), ["ego", "last 2 s"]);
     }
 
     #[test]
