@@ -83,8 +83,8 @@ pub(crate) struct Person {
     companions: Vec<Companion>,
     /// Where the person was, the latest last, as far back as companions follow.
     trail: VecDeque<Pose>,
-    /// The last crosswalk of a group, where companions may still be.
-    left: Option<Left>,
+    /// The walk over the last crosswalk and its direction, while companions are still on the road.
+    left: Option<(usize, bool)>,
     /// Amplitude of swaying to the sides, metres, and its initial phase.
     sway: (f64, f64),
 }
@@ -98,15 +98,6 @@ struct Companion {
     place: DVec2,
     pose: Pose,
     speed: f64,
-}
-
-/// A crosswalk behind a person.
-#[derive(Clone, Copy, Debug)]
-struct Left {
-    /// Its walk and the direction.
-    way: (usize, bool),
-    /// Metres from its end to the start of the present walk.
-    since: f64,
 }
 
 impl Companion {
@@ -285,12 +276,9 @@ impl Person {
             let way = (self.walk, self.forward);
             (way, self.progress, activity)
         });
-        let behind = self.left.and_then(|left| {
-            let since = left.since + self.progress;
-            let (walk, forward) = left.way;
-            let progress = network.walks[walk].track.length() + since;
-            let may_be_there = since < self.depth() + ROW;
-            may_be_there.then_some((left.way, progress, Activity::Crosses { forward }))
+        let behind = self.left.map(|(walk, forward)| {
+            let end = network.walks[walk].track.length();
+            ((walk, forward), end, Activity::Crosses { forward })
         });
         let places = [here, behind].into_iter().flatten();
         let places =
@@ -299,8 +287,7 @@ impl Person {
             let track = &network.walks[walk].track;
             let along = |s: f64| if forward { s } else { track.length() - s };
             let (mut first, mut last) = (progress, progress);
-            for companion in &self.companions {
-                let progress = along(track.project(companion.pose.position));
+            for progress in self.progress_of_companions(network, (walk, forward)) {
                 (first, last) = (first.max(progress), last.min(progress));
             }
             OnCrosswalk {
@@ -309,6 +296,36 @@ impl Person {
                 activity,
             }
         })
+    }
+
+    /// Metres along a walk where its companions are.
+    fn progress_of_companions(
+        &self,
+        network: &Network,
+        (walk, forward): (usize, bool),
+    ) -> impl Iterator<Item = f64> {
+        let track = &network.walks[walk].track;
+        self.companions.iter().map(move |companion| {
+            let s = track.project(companion.pose.position);
+            if forward { s } else { track.length() - s }
+        })
+    }
+
+    /// Forgets the crosswalk behind once all companions are off the road.
+    fn forget_crosswalk(&mut self, network: &Network) {
+        let is_over = |(walk, forward): (usize, bool)| {
+            let Some(crosswalk) = network.walks[walk].crosswalk else {
+                return true;
+            };
+            let (low, high) = network.crosswalks[crosswalk].on_road;
+            let length = network.walks[walk].track.length();
+            let curb = if forward { high } else { length - low };
+            let mut progress = self.progress_of_companions(network, (walk, forward));
+            progress.all(|progress| progress >= curb)
+        };
+        if self.left.is_some_and(is_over) {
+            self.left = None;
+        }
     }
 
     /// True once the person has left the scene.
@@ -374,6 +391,7 @@ impl TrafficSimulation<'_> {
                 self.choose_walk(&mut person, length);
             }
             person.lead(self.dt);
+            person.forget_crosswalk(self.network);
             self.people[i] = person;
         }
         self.people.retain(|person| !person.has_left());
@@ -484,12 +502,7 @@ impl TrafficSimulation<'_> {
         };
         let has_crossed = self.network.walks[from].crosswalk.is_some();
         if has_crossed && !person.companions.is_empty() {
-            person.left = Some(Left {
-                way: (from, person.forward),
-                since: 0.0,
-            });
-        } else if let Some(left) = &mut person.left {
-            left.since += length;
+            person.left = Some((from, person.forward));
         }
         (person.walk, person.forward) = (walk, forward);
         person.progress -= length;
