@@ -50,7 +50,7 @@ impl Explained<'_> {
     fn choice(&self, page: &mut Page) -> anyhow::Result<()> {
         let decision = self.decision;
         let chosen = &decision.candidates[decision.chosen];
-        let rejected = reasons::best_rejected(decision);
+        let alternative = reasons::best_alternative(decision);
         page.lede(format!(
             "{:.1} s after the start, {} candidates drove {:.1} s among others who react: the best {} \
              of them in {} futures, the others in fewer.{} {}",
@@ -77,7 +77,7 @@ impl Explained<'_> {
         let mut compared = Vec::new();
         let ordinary = reasons::ordinary(decision);
         for (what, other) in [
-            ("the best alternative with another path", rejected),
+            ("the best alternative with another path", alternative),
             ("IDM at the speed limit, without rollouts", ordinary),
         ] {
             let Some(i) = other.filter(|&i| i != decision.chosen && !compared.contains(&i)) else {
@@ -99,9 +99,9 @@ impl Explained<'_> {
             "Where the ego goes: the chosen candidate in the ego's colour, those it is compared with \
              in dark; a dot at the end of each.",
         )?;
-        if let Some(i) = rejected {
-            let caption = "The first future of the chosen candidate and of the best rejected one. All \
-                           can be played and clicked into in viewer.html.";
+        if let Some(i) = alternative {
+            let caption = "The first future of the chosen candidate and of the best alternative with \
+                           another path. All can be played and clicked into in viewer.html.";
             let film = film(self.scenario, [chosen, &decision.candidates[i]])?;
             section.film(&film, caption);
         }
@@ -227,10 +227,10 @@ fn scores(page: &mut Page, decision: &Decision, order: &[usize]) {
 }
 
 /// Writes the behaviour of the agents nearest to the ego, with the chosen candidate and with the
-/// best rejected one.
+/// best alternative with another path.
 fn others(page: &mut Page, decision: &Decision, order: &[usize], scenario: &Scenario) {
     let last = order[order.len() - 1];
-    let other = reasons::best_rejected(decision).unwrap_or(last);
+    let other = reasons::best_alternative(decision).unwrap_or(last);
     let shown = [decision.chosen, other].map(|i| &decision.candidates[i]);
     let scene = scenario.present();
     let ego = scene.ego_now().state.pose.position;
@@ -260,8 +260,8 @@ fn others(page: &mut Page, decision: &Decision, order: &[usize], scenario: &Scen
         .collect();
     page.section("What the others did")
         .prose(&format!(
-            "Means over the futures, with the chosen candidate (\"{}\") and with the best rejected \
-             one (\"{}\"). An agent that drives less far with one of them yields to it.",
+            "Means over the futures, with the chosen candidate (\"{}\") and with the best alternative \
+             with another path (\"{}\"). An agent that drives less far with one of them yields to it.",
             shown[0].kind, shown[1].kind
         ))
         .table(
@@ -272,7 +272,7 @@ fn others(page: &mut Page, decision: &Decision, order: &[usize], scenario: &Scen
                 "chosen: drives, m",
                 "closest, m",
                 "hits",
-                "rejected: drives, m",
+                "alternative: drives, m",
                 "closest, m",
                 "hits",
             ],

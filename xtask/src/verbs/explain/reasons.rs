@@ -18,7 +18,7 @@ const MOST_DIFFERENCES: usize = 3;
 
 /// The best candidate that was not chosen and is not the same drive under another name: one that
 /// ends more than 2 m from the chosen one, or that is worth something else.
-pub(super) fn best_rejected(decision: &Decision) -> Option<usize> {
+pub(super) fn best_alternative(decision: &Decision) -> Option<usize> {
     let chosen = &decision.candidates[decision.chosen];
     let differs = |evaluation: &CandidateEvaluation| match (end(evaluation), end(chosen)) {
         (Some(a), Some(b)) => a.distance(b) > SAME_PLACE,
@@ -47,13 +47,13 @@ pub(super) fn ordinary(decision: &Decision) -> Option<usize> {
 }
 
 /// Weight of a decision: the margin of the chosen candidate over the ordinary driver, plus a tenth
-/// of its margin over the best rejected candidate. The tenth is chosen by hand.
+/// of its margin over the best alternative with another path. The tenth is chosen by hand.
 pub(crate) fn weight(decision: &Decision) -> f64 {
     let chosen = decision.candidates[decision.chosen].value;
     let margin = |other: Option<usize>| {
         other.map_or(0.0, |i| (chosen - decision.candidates[i].value).max(0.0))
     };
-    margin(ordinary(decision)) + 0.1 * margin(best_rejected(decision))
+    margin(ordinary(decision)) + 0.1 * margin(best_alternative(decision))
 }
 
 fn end(evaluation: &CandidateEvaluation) -> Option<gump_geometry::DVec2> {

@@ -7,7 +7,7 @@ use gump_eval::Notes;
 use gump_eval::behaviour::{BehaviourSettings, ScenarioCounts, ScenarioTallies};
 use gump_eval::decoding::DecodedWorldName;
 use gump_eval::results::{self, Entry, MissingShards};
-use gump_metrics::behaviour::{Count, Key, Measure, Tally};
+use gump_metrics::behaviour::{Class, Count, Key, Measure, Tally};
 use gump_metrics::{Interval, intervals};
 use gump_scene::Seed;
 use gump_viz::Bars;
@@ -244,7 +244,15 @@ fn chart(label: &str, columns: &[&Column], keys: &[Key], shows: impl Fn(Measure)
         match measure {
             Measure::Standing | Measure::Speed => format!("{class}, {seconds} s"),
             Measure::ComeToRest => format!("{class}, slow, {seconds} s"),
-            _ => format!("{}, {class}", measure.name().replace('_', " ")),
+            _ => {
+                let name = measure.name();
+                // The title of the axis has the unit.
+                let words = name.strip_suffix("_s").unwrap_or(name).replace('_', " ");
+                match class {
+                    Class::Light => words,
+                    _ => format!("{words}, {class}"),
+                }
+            }
         }
     });
     let legend = columns.iter().map(|column| column.label()).collect();
