@@ -148,7 +148,7 @@ mod tests {
     fn every_constraint_has_a_verdict() {
         let scenario = fixture::scenario(
             "lane 1: -50,0 90,0\nlane 2: -50,4 90,4\nego vehicle 0: 0,0 velocity 7,0 size 4,2\n\
-             agent vehicle 1: 18.5,0 velocity 0,0.5 size 9,2",
+             agent vehicle 1: 18.5,0 heading 0 velocity 0,0.5 size 9,2",
         )
         .unwrap();
         let names = [("ego", 0), ("truck", 1)];
