@@ -12,7 +12,7 @@ use gump_rollout::WorldModel;
 use gump_scene::{Scenario, ScenarioTag, Seed};
 use rayon::prelude::*;
 
-use crate::check::{Clause, check_clauses, through_time};
+use crate::check::{Clause, check_clauses, check_objects, through_time};
 use crate::prompt::PromptSpec;
 use crate::prompt_search::{Search, any_start};
 use crate::site::Site;
@@ -44,7 +44,7 @@ pub struct CheckedScene {
     /// Its simulated future, at 10 Hz. The present is the instant at which the prompts hold, at
     /// most two seconds later; up to a second before it is kept.
     pub scenario: Scenario,
-    /// The check of the present.
+    /// The check of the present, and of the constraints on single objects in the scene as generated.
     pub clauses: Vec<Clause>,
     /// The attempt that made this scene, from 1.
     pub attempts: usize,
@@ -114,6 +114,7 @@ pub fn make_many(
         futures::extend(worlds.traffic, &mut scenario, order.seconds, stream)?;
         let mut clauses = check_clauses(&scenario, &[], request.counts.as_ref());
         through_time(&mut clauses, &scenario, request.counts.as_ref());
+        clauses.extend(check_objects(&scene, &request.map, &request.objects));
         Ok(CheckedScene {
             clauses,
             scene,
@@ -319,6 +320,8 @@ fn judged(
     futures::extend(world, &mut checked.scenario, seconds, stream.fork(4))?;
     checked.clauses = check_clauses(&checked.scenario, prompts, counts);
     through_time(&mut checked.clauses, &checked.scenario, counts);
+    let constraints = check_objects(&checked.scene, &order.request.map, &order.request.objects);
+    checked.clauses.extend(constraints);
     Ok(checked)
 }
 
