@@ -10,12 +10,12 @@ const DRAWS: usize = 128;
 
 /// Shows how plausible the futures of the agents near the ego are, and what the challenge measures
 /// of them; nothing where it is not defined.
-pub(crate) fn realism(viewer: &mut Viewer<'_>, scenario: &Scenario, futures: &[Rollout]) {
+pub(crate) fn plausibility(viewer: &mut Viewer<'_>, scenario: &Scenario, futures: &[Rollout]) {
     let Some(annotations) = Annotations::of(scenario, futures) else {
         return;
     };
     for agent in annotations.agents {
-        viewer.realism(agent.agent, agent.plausibility);
+        viewer.plausibility(agent.agent, agent.plausibility);
         viewer.deeds(agent.agent, agent.deeds);
     }
     for series in annotations.series {
@@ -76,7 +76,7 @@ mod tests {
         let plain = Viewer::new(&scenario).to_html();
         let mut viewer = Viewer::new(&scenario);
         viewer.futures(&futures);
-        realism(&mut viewer, &scenario, &futures);
+        plausibility(&mut viewer, &scenario, &futures);
         let html = viewer.to_html();
         let is_shown = |what: &str| html.contains(what) && !plain.contains(what);
         for name in [
@@ -86,8 +86,8 @@ mod tests {
             assert!(is_shown(name), "{name}");
         }
         // The ego and two others have a number, the obstacle has none.
-        assert_eq!(html.matches("\"realism\":null").count(), 1);
-        assert_eq!(plain.matches("\"realism\":null").count(), 4);
+        assert_eq!(html.matches("\"plausibility\":null").count(), 1);
+        assert_eq!(plain.matches("\"plausibility\":null").count(), 4);
     }
 
     #[test]
@@ -118,10 +118,10 @@ mod tests {
         let futures = vec![pulls_out(); 4];
         let mut viewer = Viewer::new(&scenario);
         viewer.futures(&futures);
-        realism(&mut viewer, &scenario, &futures);
+        plausibility(&mut viewer, &scenario, &futures);
         let html = viewer.to_html();
         assert!(html.contains("\"deeds\":\"parked move in 100 % of futures\""));
-        assert_eq!(html.matches("\"realism\":0.0").count(), 1);
+        assert_eq!(html.matches("\"plausibility\":0.0").count(), 1);
     }
 
     #[test]
@@ -129,7 +129,7 @@ mod tests {
         let scenario = scenario("0");
         let futures = vec![Rollout::begin(scenario.present())];
         let mut viewer = Viewer::new(&scenario);
-        realism(&mut viewer, &scenario, &futures);
+        plausibility(&mut viewer, &scenario, &futures);
         assert_eq!(viewer.to_html(), Viewer::new(&scenario).to_html());
     }
 }

@@ -106,7 +106,7 @@ impl<'a> Viewer<'a> {
 
     /// Sets how plausible an agent's futures are, 0 to 1, shown as a colour: its realism times the
     /// share of futures without an implausible action.
-    pub fn realism(&mut self, agent: AgentId, plausibility: f64) -> &mut Self {
+    pub fn plausibility(&mut self, agent: AgentId, plausibility: f64) -> &mut Self {
         self.plausibility.insert(agent, plausibility);
         self
     }

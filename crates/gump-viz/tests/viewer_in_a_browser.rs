@@ -198,7 +198,7 @@ fn the_viewer_plays_and_switches_in_a_browser() {
         draws: (0..64).map(draw).collect(),
     });
     for (id, plausibility) in [(0, 0.9), (7, 0.4), (9, 0.1)] {
-        viewer.realism(AgentId(id), plausibility);
+        viewer.plausibility(AgentId(id), plausibility);
     }
     for (name, score) in [("slow ahead", Some(0.25)), ("fast", None)] {
         viewer.candidate(CandidatePath {

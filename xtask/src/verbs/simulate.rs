@@ -125,7 +125,7 @@ impl Args {
         let mut viewer = Viewer::new(&scenario);
         run.phase("look closer", |run| {
             let _waiting = run.wait("looking closer");
-            annotations::realism(&mut viewer, &scenario, &imagined.rollouts);
+            annotations::plausibility(&mut viewer, &scenario, &imagined.rollouts);
             annotations::heat(&mut viewer, std::mem::take(&mut imagined.samples));
             Ok(())
         })?;

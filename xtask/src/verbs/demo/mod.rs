@@ -124,7 +124,7 @@ fn view(demo: &Demo, run: &Run) -> anyhow::Result<()> {
             demo.futures.len()
         ))
         .futures(&demo.futures);
-    annotations::realism(&mut viewer, &demo.scenario, &demo.futures);
+    annotations::plausibility(&mut viewer, &demo.scenario, &demo.futures);
     let world = World::build(
         run.device(),
         &shipped::world(),

@@ -100,7 +100,7 @@ fn add(
     let mut viewer = Viewer::new(scenario);
     viewer.note(note(args, &summary.total()));
     viewer.futures(&imagined.rollouts);
-    annotations::realism(&mut viewer, scenario, &imagined.rollouts);
+    annotations::plausibility(&mut viewer, scenario, &imagined.rollouts);
     annotations::heat(&mut viewer, std::mem::take(&mut imagined.samples));
     gallery.add(&viewer);
     Ok((imagined, summary, world.notes(scenario)))
