@@ -225,7 +225,7 @@ fn names_of_nothing_are_wrong_arguments() {
     check(&format!("{simulate} --config none.toml"), "none.toml");
     check(
         "evaluate behaviour --world idm --scenarios scene.tfrecord#1",
-        "found the name of one scenario: scene.tfrecord#1",
+        "expected #0, the only scenario there is, found #1",
     );
     let lists = Path::new(env!("CARGO_MANIFEST_DIR")).join("../datasets/benchmarks");
     let list = lists.join("recorded.toml").display().to_string();

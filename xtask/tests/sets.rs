@@ -135,7 +135,7 @@ fn a_list_makes_the_same_scenes_anywhere_and_results_name_it() {
     fails(
         &folder,
         "evaluate wosac --scenarios small.toml#x --world log",
-        1,
+        2,
         "found small.toml#x",
     );
 }
