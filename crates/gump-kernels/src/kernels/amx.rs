@@ -308,7 +308,7 @@ impl Amx {
                     block.as_ptr(),
                     panels,
                     (to.data.as_mut_ptr(), 4 * to.stride),
-                )
+                );
             };
             return;
         }

@@ -140,8 +140,8 @@ impl Way {
             last += 1;
         }
         let (mut poses, mut now) = (Vec::<(f64, Pose)>::new(), 0.0);
-        for k in first..=last {
-            let rear = log[k]? * Pose::new(-wheels.axle_m, 0.0, 0.0);
+        for (k, logged) in log.iter().enumerate().take(last + 1).skip(first) {
+            let rear = (*logged)? * Pose::new(-wheels.axle_m, 0.0, 0.0);
             let at = match poses.last() {
                 None => Some(0.0),
                 // Jitter is no way.
