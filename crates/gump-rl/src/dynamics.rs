@@ -13,9 +13,9 @@ use serde::{Deserialize, Serialize};
 #[serde(rename_all = "kebab-case", deny_unknown_fields)]
 #[non_exhaustive]
 pub enum Dynamics {
-    /// Two numbers, held for the step: acceleration (-1 the hardest braking, 0 none, 1 the hardest
-    /// acceleration; braking ends at rest, for a vehicle that rolls backwards, too) and steering (the share of the sharpest turn possible at this speed, positive
-    /// to the left), of a kinematic bicycle.
+    /// Two numbers, held for the step, of a kinematic bicycle: acceleration (-1 the hardest braking, 0
+    /// none, 1 the hardest acceleration) and steering (the share of the sharpest turn possible at this
+    /// speed, positive to the left). Braking ends at rest, for a vehicle that rolls backwards, too.
     Bicycle(BicycleLimits),
     /// Three numbers: the ego's pose after the step, in its own frame, tracked perfectly.
     NextPose(PoseLimits),

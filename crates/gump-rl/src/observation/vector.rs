@@ -488,25 +488,14 @@ mod tests {
 
     #[test]
     fn agents_out_of_range_are_not_seen() {
-        let prepared = |x: f64| {
-            let text = format!("ego vehicle 0: 0,0\nagent vehicle 1: {x},0");
-            PreparedScenario::new(fixture::scenario(&text).unwrap(), 0.5).unwrap()
-        };
         for (x, expected) in [(79.0, 1), (81.0, 0)] {
-            let prepared = prepared(x);
-            let state = Rules::default().reset(&prepared);
-            let view = View {
-                prepared: &prepared,
-                state: &state,
-                now: prepared.logged(0),
-                before: None,
-            };
-            assert_eq!(VIEW.chosen(&view).len(), expected);
+            let text = format!("ego vehicle 0: 0,0\nagent vehicle 1: {x},0");
+            assert_eq!(chosen(&VIEW, &text).len(), expected);
         }
     }
 
-    /// The ids of all agents, in order.
-    fn ordered(order: AgentOrder, text: &str) -> Vec<i64> {
+    /// The ids of the agents that are seen, in order.
+    fn chosen(vector: &VectorView, text: &str) -> Vec<i64> {
         let prepared = PreparedScenario::new(fixture::scenario(text).unwrap(), 0.5).unwrap();
         let state = Rules::default().reset(&prepared);
         let view = View {
@@ -515,12 +504,8 @@ mod tests {
             now: prepared.logged(0),
             before: None,
         };
-        let all = VectorView {
-            n_agents: 9,
-            order,
-            ..VIEW
-        };
-        all.chosen(&view).iter().map(|agent| agent.id.0).collect()
+        let chosen = vector.chosen(&view);
+        chosen.iter().map(|agent| agent.id.0).collect()
     }
 
     #[test]
@@ -530,9 +515,17 @@ mod tests {
         let text = "lane 1: 0,0 40,0 40,60\nroute 1\nego vehicle 0: 10,0 velocity 10,0
             agent vehicle 1: 30,0 velocity 8,0\nagent vehicle 2: 37,30 velocity 0,-10
             agent bicycle 3: 25,12 velocity 0,-5\nagent vehicle 4: 11,3.5\nagent vehicle 5: 3,-3";
+        let ordered = |order| {
+            let all = VectorView {
+                n_agents: 9,
+                order,
+                ..VIEW
+            };
+            chosen(&all, text)
+        };
         // Seconds: 2.0 + 0, 5.0 + 0.8, 1.5 + 2.1, 0.1 + 6, 0 + 22.5.
-        assert_eq!(ordered(AgentOrder::Relevance, text), [1, 3, 2, 4, 5]);
-        assert_eq!(ordered(AgentOrder::Distance, text), [4, 5, 3, 1, 2]);
+        assert_eq!(ordered(AgentOrder::Relevance), [1, 3, 2, 4, 5]);
+        assert_eq!(ordered(AgentOrder::Distance), [4, 5, 3, 1, 2]);
     }
 
     #[test]
