@@ -365,17 +365,10 @@ type Paths = [Vec<(u32, f64)>];
 fn neighbours(map: &VectorMap, agents: &[Shown], i: usize, paths: &Paths, view: &mut View) {
     let own = &agents[i];
     let (from, own_velocity) = (Axes::of(own.pose), own.velocity());
-    // A few of a row of parked cars suffice; approaching agents count as nearer.
-    let mut near: Vec<(f64, usize)> = agents
-        .iter()
-        .enumerate()
-        .filter(|(j, _)| *j != i)
-        .filter_map(|(j, other)| {
-            let place = other.pose.position - own.pose.position;
-            let away = place.length();
-            let soon = place + (other.velocity() - own_velocity) * SOON_S;
-            (away < NEIGHBOUR_REACH_M).then(|| (away + soon.length(), j))
-        })
+    // A few of a row of parked cars suffice.
+    let others = agents.iter().enumerate().filter(|(j, _)| *j != i);
+    let mut near: Vec<(f64, usize)> = others
+        .filter_map(|(j, other)| Some((distance_to_soon(own, other)?, j)))
         .collect();
     near.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
     near.truncate(NEIGHBOURS);
@@ -429,6 +422,27 @@ fn gap(own: Body, other: Body, place: DVec2, direction: DVec2) -> f64 {
     let here = place.abs() - mine - reach(theirs);
     let there = seen.abs() - theirs - reach(mine);
     here.max(there).max_element()
+}
+
+/// How far away another agent is now and soon, metres, if it is near enough to be a neighbour; approaching
+/// agents count as nearer.
+fn distance_to_soon(own: &Shown, other: &Shown) -> Option<f64> {
+    let place = other.pose.position - own.pose.position;
+    let away = place.length();
+    let soon = place + (other.velocity() - own.velocity()) * SOON_S;
+    (away < NEIGHBOUR_REACH_M).then(|| away + soon.length())
+}
+
+/// Whether agent `i` of those of a frame would have one of `others`, too, as a neighbour if it were shown.
+pub(super) fn misses_any(agents: &[Shown], i: usize, others: &[Shown]) -> bool {
+    let own = &agents[i];
+    let nearest = |other: &Shown| distance_to_soon(own, other);
+    let Some(missed) = others.iter().filter_map(nearest).min_by(f64::total_cmp) else {
+        return false;
+    };
+    let shown = agents.iter().enumerate().filter(|(j, _)| *j != i);
+    let nearer = shown.filter_map(|(_, other)| nearest(other));
+    nearer.filter(|away| *away < missed).count() < NEIGHBOURS
 }
 
 /// Marks the paths that an agent is on, and how far ahead.

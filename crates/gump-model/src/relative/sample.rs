@@ -10,10 +10,10 @@ use rand::Rng as _;
 use serde::{Deserialize, Serialize};
 
 use crate::relative::graph::{
-    Body, EDGE_NUMBERS, EdgeRow, Lights, NODE_NUMBERS, PAST, Shown, look, past_edge,
+    Body, EDGE_NUMBERS, EdgeRow, Lights, NODE_NUMBERS, PAST, Shown, look, misses_any, past_edge,
 };
 use crate::relative::grid::{FIELDS, STILL_M, quantize};
-use crate::relative::map::{Hidden, PIECE_NUMBERS, VectorMap};
+use crate::relative::map::{Hidden, PATH_M, PIECE_NUMBERS, VectorMap};
 use crate::relative::returns::{Returns, steered};
 use crate::relative::route::{Route, of_log};
 use crate::steps::stride_of;
@@ -54,6 +54,11 @@ pub struct SampleConfig {
     pub forget_free: f64,
     /// Probability that a vehicle is shown with its route, from the first frame on or a later one.
     pub routes: f64,
+    /// Whether only agents learn that see all that they would see in a rollout. Without it those at the rim
+    /// of a sample learn, too, whose leader may be one of the agents left out by `max_agents`, or whose
+    /// light may be beyond the prepared map: they stop for reasons that are not shown. False by default, as
+    /// in the trainings of all published weights.
+    pub whole_views: bool,
 }
 
 impl Default for SampleConfig {
@@ -74,6 +79,7 @@ impl Default for SampleConfig {
             forget: 0.0,
             forget_free: 0.0,
             routes: 0.0,
+            whole_views: false,
         }
     }
 }
@@ -407,7 +413,42 @@ pub fn draw(
         free_pasts,
         returns: driver.map_or(config.returns, TrackDriver::returns),
     };
-    Some(assemble(&map, &tracks, &lights, manner))
+    let rim = config.whole_views.then(|| Rim {
+        centre,
+        left_out: frames.iter().map(|frame| left_out(frame, &ids)).collect(),
+    });
+    Some(assemble(&map, &tracks, &lights, manner, rim.as_ref()))
+}
+
+/// What lies beyond a sample.
+struct Rim {
+    centre: DVec2,
+    /// By frame, the agents that are not in the sample.
+    left_out: Vec<Vec<Shown>>,
+}
+
+impl Rim {
+    /// Whether agent `i` of those of frame `t` sees all that it would see without it.
+    fn is_far_from(&self, t: usize, agents: &[Shown], i: usize) -> bool {
+        let away = agents[i].pose.position.distance(self.centre);
+        away + PATH_M < MAP_M && !misses_any(agents, i, &self.left_out[t])
+    }
+}
+
+/// The agents of a frame that are none of these.
+fn left_out(frame: &Frame, ids: &[AgentId]) -> Vec<Shown> {
+    let moving = frame.agents().iter().filter(|agent| agent.kind.is_moving());
+    let others = moving.filter(|agent| !ids.contains(&agent.id));
+    let shown = others.map(|agent| {
+        let body = Body {
+            kind: agent.kind,
+            length: agent.length,
+            width: agent.width,
+            sized: true,
+        };
+        Shown::first(body, agent.state.pose, agent.state.velocity)
+    });
+    shown.collect()
 }
 
 /// The sample of all frames of a scenario from `start` on, without hiding and displacement, of the
@@ -428,7 +469,7 @@ pub fn whole(
     let track = |id: &AgentId| track(&frames, *id, &plain, 0.0, &mut nothing);
     let tracks: Vec<Track> = ids.iter().map(track).collect();
     let lights = lights(scenario, start, stride, n_frames);
-    Some(assemble(map, &tracks, &lights, Manner::default()))
+    Some(assemble(map, &tracks, &lights, Manner::default(), None))
 }
 
 /// Tells the routes of a share of the vehicles, half of them from the first frame on.
@@ -637,7 +678,14 @@ impl Default for Manner {
     }
 }
 
-fn assemble(map: &VectorMap, tracks: &[Track], lights: &[Lights], manner: Manner) -> Sample {
+/// With a rim, agents near it are shown and have no targets.
+fn assemble(
+    map: &VectorMap,
+    tracks: &[Track],
+    lights: &[Lights],
+    manner: Manner,
+    rim: Option<&Rim>,
+) -> Sample {
     let n_frames = lights.len();
     let (forget, seed) = manner.forget;
     let mut rng = seed.rng();
@@ -706,7 +754,8 @@ fn assemble(map: &VectorMap, tracks: &[Track], lights: &[Lights], manner: Manner
                 push(n_nodes + at, row);
             }
             graph.offsets.push(graph.sources.len() as u32);
-            let learns = !tracks[a].is_obstacle;
+            let sees_all = rim.is_none_or(|rim| rim.is_far_from(t, &agents, i));
+            let learns = !tracks[a].is_obstacle && sees_all;
             let target = target(&tracks[a], t, own, manner.returns);
             if let Some(target) = target.filter(|target| learns && target.weight > 0.0) {
                 let node = node_of[t][a].expect("the agent is present");
@@ -826,6 +875,40 @@ mod tests {
         let fewer = never.iter().zip(&always).filter(|(n, a)| a.0 < n.0).count();
         assert!(fewer >= 6, "{fewer} of 12");
         assert_eq!(edges(1.0), always);
+    }
+
+    #[test]
+    fn who_misses_a_neighbour_or_the_end_of_its_path_does_not_learn() {
+        let cars = |places: &[i32]| {
+            let cars = places.iter().enumerate();
+            let lines = cars.map(|(i, x)| format!("agent vehicle {}: {x},0 velocity 8,0\n", i + 1));
+            let map = "lane 1: -400,0 400,0 speed 15\nego vehicle 0: 0,0 velocity 8,0\n";
+            fixture::scenario(&(map.to_owned() + &lines.collect::<String>())).unwrap()
+        };
+        // How many of the agents that are shown have targets. The sample lies around one of them.
+        let learning = |scenario: &Scenario, max_agents: usize, whole_views: bool| {
+            let config = SampleConfig {
+                max_agents,
+                whole_views,
+                ..SampleConfig::plain()
+            };
+            let learning = |seed: u64| {
+                let sample = draw(scenario, &config, None, Seed(seed)).unwrap();
+                let agents: std::collections::BTreeSet<u32> =
+                    sample.targets.iter().map(|target| target.agent).collect();
+                agents.len()
+            };
+            (0..8).map(learning).collect::<Vec<_>>()
+        };
+        let queue = cars(&[12, 24, 36, 48]);
+        assert_eq!(learning(&queue, 3, false), [3; 8]);
+        // Any other car of the queue is within sight of all three.
+        assert_eq!(learning(&queue, 3, true), [0; 8]);
+        assert_eq!(learning(&queue, 64, true), [5; 8]);
+        // Around one of these the map ends before the path of the other.
+        let far = cars(&[200]);
+        assert_eq!(learning(&far, 64, false), [2; 8]);
+        assert_eq!(learning(&far, 64, true), [1; 8]);
     }
 
     #[test]
