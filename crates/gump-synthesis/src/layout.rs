@@ -11,29 +11,50 @@ use crate::RoadFamily;
 use crate::curve::{Track, bend, line};
 use crate::plan::{Control, NodePlan, Plan, RoadPlan};
 
+/// How sharply roads bend.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Winding {
+    /// All angles up to the sharpest are equally likely.
+    Even,
+    /// Most bends are slight, as recorded ones: at over 14 m/s nine tenths of recorded vehicles turn by less
+    /// than 0.015 radians in a second.
+    Slight,
+}
+
+impl Winding {
+    /// The angle of a bend, up to `most` radians to either side.
+    fn bend(self, most: f64, rng: &mut Rng) -> f64 {
+        let angle = rng.random_range(-most..most);
+        match self {
+            Self::Even => angle,
+            Self::Slight => angle * (angle / most).powi(4),
+        }
+    }
+}
+
 /// Draws a plan of this family around the origin, reaching `extent` metres.
-pub(crate) fn draw_plan(family: RoadFamily, extent: f64, rng: &mut Rng) -> Plan {
+pub(crate) fn draw_plan(family: RoadFamily, extent: f64, winding: Winding, rng: &mut Rng) -> Plan {
     match family {
-        RoadFamily::SignalizedCrossing => crossing(Control::Signals, extent, rng),
+        RoadFamily::SignalizedCrossing => crossing(Control::Signals, extent, winding, rng),
         RoadFamily::StopCrossing => {
             let control = if rng.random_bool(0.5) {
                 Control::AllWayStop
             } else {
                 Control::MinorStop
             };
-            crossing(control, extent, rng)
+            crossing(control, extent, winding, rng)
         }
-        RoadFamily::TeeJunction => tee(extent, rng),
-        RoadFamily::Roundabout => roundabout(extent, rng),
-        RoadFamily::Arterial => arterial(extent, rng),
-        RoadFamily::CurvedRoad => curved_road(extent, rng),
+        RoadFamily::TeeJunction => tee(extent, winding, rng),
+        RoadFamily::Roundabout => roundabout(extent, winding, rng),
+        RoadFamily::Arterial => arterial(extent, winding, rng),
+        RoadFamily::CurvedRoad => curved_road(extent, winding, rng),
         RoadFamily::OnRamp => on_ramp(extent, rng),
-        RoadFamily::MidBlockCrosswalk => mid_block(extent, rng),
-        RoadFamily::Grid => grid(extent, rng),
+        RoadFamily::MidBlockCrosswalk => mid_block(extent, winding, rng),
+        RoadFamily::Grid => grid(extent, winding, rng),
     }
 }
 
-fn crossing(control: Control, extent: f64, rng: &mut Rng) -> Plan {
+fn crossing(control: Control, extent: f64, winding: Winding, rng: &mut Rng) -> Plan {
     let lanes = if control == Control::Signals {
         1..=3
     } else {
@@ -51,7 +72,7 @@ fn crossing(control: Control, extent: f64, rng: &mut Rng) -> Plan {
         .map(|leg| {
             let angle = f64::from(leg) * FRAC_PI_2 + if leg % 2 == 1 { skew } else { 0.0 };
             let style = if leg % 2 == 0 { &main } else { &minor };
-            spoke(style, 0, Pose::new(0.0, 0.0, angle), extent, rng)
+            spoke(style, 0, (Pose::new(0.0, 0.0, angle), extent), winding, rng)
         })
         .collect();
     Plan {
@@ -60,7 +81,7 @@ fn crossing(control: Control, extent: f64, rng: &mut Rng) -> Plan {
     }
 }
 
-fn tee(extent: f64, rng: &mut Rng) -> Plan {
+fn tee(extent: f64, winding: Winding, rng: &mut Rng) -> Plan {
     let control = match rng.random_range(0..10) {
         0..=3 => Control::Signals,
         4..=5 => Control::AllWayStop,
@@ -75,14 +96,14 @@ fn tee(extent: f64, rng: &mut Rng) -> Plan {
     let (main, minor) = (street(n_main, true, rng), street(1, false, rng));
     let skew = rng.random_range(-0.3..0.3);
     let roads = [(&main, 0.0), (&minor, FRAC_PI_2 + skew), (&main, PI)]
-        .map(|(style, angle)| spoke(style, 0, Pose::new(0.0, 0.0, angle), extent, rng));
+        .map(|(style, angle)| spoke(style, 0, (Pose::new(0.0, 0.0, angle), extent), winding, rng));
     Plan {
         nodes: vec![junction(control, rng)],
         roads: roads.into(),
     }
 }
 
-fn roundabout(extent: f64, rng: &mut Rng) -> Plan {
+fn roundabout(extent: f64, winding: Winding, rng: &mut Rng) -> Plan {
     let n_legs = rng.random_range(3..=4);
     let radius = rng.random_range(15.0..19.0) + if n_legs == 4 { 2.0 } else { 0.0 };
     let spokes_style = RoadPlan {
@@ -129,8 +150,9 @@ fn roundabout(extent: f64, rng: &mut Rng) -> Plan {
             position: at,
             heading: angle,
         };
+        let whole = (start, extent - radius);
         plan.roads
-            .push(spoke(&spokes_style, i, start, extent - radius, rng));
+            .push(spoke(&spokes_style, i, whole, winding, rng));
     }
     if rng.random_bool(0.5) {
         add_crosswalks_to_spokes(&mut plan, 24.0);
@@ -158,7 +180,7 @@ fn add_crosswalks_to_spokes(plan: &mut Plan, distance: f64) {
     }
 }
 
-fn arterial(extent: f64, rng: &mut Rng) -> Plan {
+fn arterial(extent: f64, winding: Winding, rng: &mut Rng) -> Plan {
     let style = RoadPlan {
         speed_limit: rng.random_range(15.0..20.0),
         parking: false,
@@ -166,19 +188,19 @@ fn arterial(extent: f64, rng: &mut Rng) -> Plan {
     };
     Plan {
         nodes: Vec::new(),
-        roads: vec![through_road(&style, extent * 1.2, 0.35, rng)],
+        roads: vec![through_road(&style, extent * 1.2, (0.35, winding), rng)],
     }
 }
 
-fn curved_road(extent: f64, rng: &mut Rng) -> Plan {
+fn curved_road(extent: f64, winding: Winding, rng: &mut Rng) -> Plan {
     let style = street(1, true, rng);
     Plan {
         nodes: Vec::new(),
-        roads: vec![through_road(&style, extent * 1.1, 1.0, rng)],
+        roads: vec![through_road(&style, extent * 1.1, (1.0, winding), rng)],
     }
 }
 
-fn mid_block(extent: f64, rng: &mut Rng) -> Plan {
+fn mid_block(extent: f64, winding: Winding, rng: &mut Rng) -> Plan {
     let style = RoadPlan {
         sidewalks: true,
         ..street(rng.random_range(1..=2), true, rng)
@@ -188,7 +210,7 @@ fn mid_block(extent: f64, rng: &mut Rng) -> Plan {
     } else {
         Control::MinorYield
     };
-    let whole = through_road(&style, extent, 0.3, rng).reference;
+    let whole = through_road(&style, extent, (0.3, winding), rng).reference;
     let middle = whole.length() / 2.0;
     let half = |reference: Track, ends| RoadPlan {
         reference,
@@ -268,7 +290,7 @@ fn on_ramp(extent: f64, rng: &mut Rng) -> Plan {
     }
 }
 
-fn grid(extent: f64, rng: &mut Rng) -> Plan {
+fn grid(extent: f64, winding: Winding, rng: &mut Rng) -> Plan {
     let half = dvec2(rng.random_range(34.0..48.0), rng.random_range(34.0..48.0));
     let (east_west, north_south) = (
         street(rng.random_range(1..=2), true, rng),
@@ -301,7 +323,8 @@ fn grid(extent: f64, rng: &mut Rng) -> Plan {
                 heading: direction.to_angle(),
             };
             let length = extent - direction.length();
-            plan.roads.push(spoke(style, i, start, length, rng));
+            plan.roads
+                .push(spoke(style, i, (start, length), winding, rng));
         }
     }
     plan
@@ -357,12 +380,18 @@ pub(crate) fn street(n: usize, major: bool, rng: &mut Rng) -> RoadPlan {
 }
 
 /// A road of this style from a junction outwards, straight at first, then perhaps bending.
-fn spoke(style: &RoadPlan, node: usize, start: Pose, length: f64, rng: &mut Rng) -> RoadPlan {
+fn spoke(
+    style: &RoadPlan,
+    node: usize,
+    (start, length): (Pose, f64),
+    winding: Winding,
+    rng: &mut Rng,
+) -> RoadPlan {
     // Hardly any road is quite straight; about half have a real bend.
-    let mut bends = vec![(length / 2.0, 0.45 * length, rng.random_range(-0.12..0.12))];
+    let mut bends = vec![(length / 2.0, 0.45 * length, winding.bend(0.12, rng))];
     if rng.random_bool(0.5) && length > 90.0 {
         let reach = rng.random_range(20.0..30.0);
-        bends.push((45.0 + reach, reach, rng.random_range(-0.45..0.45)));
+        bends.push((45.0 + reach, reach, winding.bend(0.45, rng)));
     }
     RoadPlan {
         reference: Track::through(&bend(start, length, &bends)),
@@ -373,7 +402,12 @@ fn spoke(style: &RoadPlan, node: usize, start: Pose, length: f64, rng: &mut Rng)
 
 /// A road of this style from border to border, its middle near the origin, with bends of up to
 /// `sharpest` radians.
-fn through_road(style: &RoadPlan, extent: f64, sharpest: f64, rng: &mut Rng) -> RoadPlan {
+fn through_road(
+    style: &RoadPlan,
+    extent: f64,
+    (sharpest, winding): (f64, Winding),
+    rng: &mut Rng,
+) -> RoadPlan {
     let n_bends = rng.random_range(1..=3);
     let bends: Vec<(f64, f64, f64)> = (0..n_bends)
         .map(|i| {
@@ -381,11 +415,7 @@ fn through_road(style: &RoadPlan, extent: f64, sharpest: f64, rng: &mut Rng) -> 
             let reach = rng.random_range(0.25..0.45) * cell;
             // Keeps the tightest radius above about 30 m.
             let most = sharpest.min(reach / 28.0);
-            (
-                (f64::from(i) + 0.5) * cell,
-                reach,
-                rng.random_range(-most..most),
-            )
+            ((f64::from(i) + 0.5) * cell, reach, winding.bend(most, rng))
         })
         .collect();
     let points = bend(Pose::IDENTITY, 2.0 * extent, &bends);

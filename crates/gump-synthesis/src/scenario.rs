@@ -8,7 +8,7 @@ use gump_scene::{AgentId, AgentKind, Frame, Light, Route, Scenario, Seed};
 use rand::Rng as _;
 use rayon::prelude::*;
 
-use crate::layout::draw_plan;
+use crate::layout::{Winding, draw_plan};
 use crate::map::{Placement, build_map, lane_id};
 use crate::network::{LaneIdx, Network};
 use crate::record::{Recording, Track};
@@ -57,7 +57,7 @@ fn draw_scenario(
     attempt: u64,
 ) -> Option<Scenario> {
     let mut rng = seed.fork(attempt).rng();
-    let plan = draw_plan(family, config.extent_m, &mut rng);
+    let plan = draw_plan(family, config.extent_m, Winding::Even, &mut rng);
     let network = Network::new(&plan, &mut rng);
     let demand = draw_demand(config, &network, &mut rng);
     let mut traffic = TrafficSimulation::new(
@@ -286,7 +286,10 @@ mod tests {
             let seed = Seed(7).fork(*k);
             let mut rng = seed.rng();
             let family = RoadFamily::ALL[*k as usize % RoadFamily::ALL.len()];
-            let network = Network::new(&draw_plan(family, config.extent_m, &mut rng), &mut rng);
+            let network = Network::new(
+                &draw_plan(family, config.extent_m, Winding::Even, &mut rng),
+                &mut rng,
+            );
             let demand = draw_demand(&config, &network, &mut rng);
             let mut traffic = TrafficSimulation::new(&network, demand, config.dt, rng);
             for _ in 0..250 {

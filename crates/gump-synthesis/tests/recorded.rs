@@ -347,7 +347,7 @@ fn half_of_the_drivers_roll_over_stop_lines() {
         ..PROFILE.config()
     };
     let scene = |k| PROFILE.synthesize_clean(&config, Seed(78).fork(k));
-    let scenes: Vec<Scenario> = (0..240).into_par_iter().map(scene).collect();
+    let scenes: Vec<Scenario> = (0..360).into_par_iter().map(scene).collect();
     let (mut passes, mut stops) = (0, 0);
     for scene in &scenes {
         let lanes = scene.map.stop_signs().iter().flat_map(|sign| &sign.lanes);

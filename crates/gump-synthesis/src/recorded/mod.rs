@@ -24,7 +24,7 @@ use rand::Rng as _;
 
 use self::driveways::Driveway;
 use self::islands::Island;
-use crate::layout::draw_plan;
+use crate::layout::{Winding, draw_plan};
 use crate::map::{build_map, lane_id};
 use crate::network::Network;
 use crate::plan::CAR_PARK_SPEED;
@@ -34,15 +34,15 @@ use crate::traffic::{Demand, TrafficSimulation};
 use crate::{RoadFamily, SynthesisConfig};
 
 /// Weights of the families: recordings are made in towns, rarely on motorways. Fitted by hand in
-/// several rounds, towards roads as fast as recorded ones.
+/// several rounds, towards traffic as fast as recorded one.
 const FAMILIES: [(RoadFamily, u32); 9] = [
     (RoadFamily::SignalizedCrossing, 8),
     (RoadFamily::StopCrossing, 12),
     (RoadFamily::TeeJunction, 6),
     (RoadFamily::Roundabout, 2),
-    (RoadFamily::Arterial, 60),
+    (RoadFamily::Arterial, 54),
     (RoadFamily::CurvedRoad, 14),
-    (RoadFamily::OnRamp, 16),
+    (RoadFamily::OnRamp, 24),
     (RoadFamily::MidBlockCrosswalk, 6),
     (RoadFamily::Grid, 8),
 ];
@@ -59,8 +59,10 @@ const UNMAPPED_CAR_PARKS: f64 = 0.7;
 /// Share of these whose road edges run across the mouths of car parks and yards, as they do across
 /// driveways in recordings.
 const CLOSED_MOUTHS: f64 = 0.6;
-/// Roads with a higher limit are wide and carry more traffic, m/s. Chosen by hand.
+/// Roads with a higher limit are wide and carry more traffic, m/s; with one that is higher still it flows,
+/// past ramps, too. Chosen by hand.
 const WIDE_ROAD_SPEED: f64 = 15.0;
+const FREEWAY_SPEED: f64 = 21.5;
 /// Metres from the centre of the scene within which the ego is chosen: with the
 /// 79 m that its tracker sees, this stays within the 150 m that roads reach.
 const EGO_REACH: f64 = 60.0;
@@ -97,7 +99,7 @@ pub(crate) fn draw_scenario(
     attempt: u64,
 ) -> Option<Scenario> {
     let mut rng = seed.fork(attempt).rng();
-    let mut plan = draw_plan(family, config.extent_m, &mut rng);
+    let mut plan = draw_plan(family, config.extent_m, Winding::Slight, &mut rng);
     dress::dress(&mut plan, config.extent_m, &mut rng);
     let (mut network, trimmed) = Network::roads(&plan, &mut rng);
     let n_lots = rng.random_range(3..=14);
@@ -165,11 +167,12 @@ fn draw_demand(
         .sum();
     // One vehicle per 24 m of lane is as much as flows.
     let most = ((metres / 24.0) as usize).max(1);
-    let has_wide_roads = network
-        .lanes
-        .iter()
-        .any(|lane| lane.speed_limit > WIDE_ROAD_SPEED);
-    let busy = if has_wide_roads { 1.5 } else { 0.65 };
+    let fastest = network.lanes.iter().map(|lane| lane.speed_limit);
+    let busy = match fastest.fold(0.0, f64::max) {
+        FREEWAY_SPEED.. => 0.8,
+        WIDE_ROAD_SPEED.. => 1.5,
+        _ => 0.85,
+    };
     let moving = draw_skewed(&config.vehicles, 1.3, busy * config.density, rng).clamp(1, most);
     // How busy people and parking are goes together.
     let bustle = rng.random_range(0.0_f64..1.0);
@@ -250,7 +253,12 @@ mod tests {
         let mut inner = 0;
         for k in 0..12 {
             let mut rng = Seed(31).fork(k).rng();
-            let mut plan = draw_plan(RoadFamily::Arterial, config.extent_m, &mut rng);
+            let mut plan = draw_plan(
+                RoadFamily::Arterial,
+                config.extent_m,
+                Winding::Slight,
+                &mut rng,
+            );
             dress::dress(&mut plan, config.extent_m, &mut rng);
             let (mut network, trimmed) = Network::roads(&plan, &mut rng);
             network.lay_lots(&plan, &trimmed, 4, 1..=6, &mut rng);

@@ -99,11 +99,11 @@ impl DriverParameters {
             middle + by_hurry * hurry + rng.random_range(-spread..spread)
         };
         let driver = Self {
-            speed_factor: around(0.96, 0.3, 0.18),
+            speed_factor: around(0.96, 0.2, 0.1),
             top_speed: 40.0,
             headway: around(1.35, -0.7, 0.4).max(0.6),
             standstill: around(2.6, -0.8, 1.2).max(1.2),
-            acceleration: around(1.7, 0.7, 0.5).max(0.8),
+            acceleration: around(1.4, 0.7, 0.5).max(0.8),
             braking: around(2.1, 0.7, 0.5).max(1.3),
             gap_time: around(4.8, -1.3, 0.8),
             bend_factor: around(0.95, 0.18, 0.12),
@@ -116,7 +116,7 @@ impl DriverParameters {
             before_people: Some(around(1.0, -0.6, 0.6).max(0.2)),
             behind_others: Some(around(0.7, -0.3, 0.4).max(0.2)),
             clearance: around(1.2, -0.2, 0.4),
-            wander: around(0.22, 0.0, 0.1),
+            wander: around(0.08, 0.0, 0.05),
             unrest: around(1.3, 0.4, 0.5).max(0.5),
             is_polite: true,
         };

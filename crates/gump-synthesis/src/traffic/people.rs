@@ -518,14 +518,19 @@ mod tests {
 
     use super::*;
     use crate::RoadFamily;
-    use crate::layout::draw_plan;
+    use crate::layout::{Winding, draw_plan};
     use crate::traffic::{Demand, Scenery};
 
     /// Looks at every step of a minute of people at crossings: before and after it.
     fn watch(look: impl Fn(&[Person], &[Person], &Network)) {
         for seed in 0..3 {
             let mut rng = Seed(seed).rng();
-            let plan = draw_plan(RoadFamily::SignalizedCrossing, 120.0, &mut rng);
+            let plan = draw_plan(
+                RoadFamily::SignalizedCrossing,
+                120.0,
+                Winding::Even,
+                &mut rng,
+            );
             let network = Network::new(&plan, &mut rng);
             let demand = Demand {
                 moving: 0,
