@@ -7,21 +7,17 @@ use rand::Rng as _;
 use super::stands;
 
 // Errors, here, in `level` and in `Noise::step`, were fitted by hand to
-// `configs/targets/waymo-like.toml` (docs/results/0017-recorded-like.md). The bounds keep the worst
+// `configs/targets/waymo-like.toml` (docs/results/0017-recorded-like.md) and to second differences of
+// recorded places and headings (docs/results/0049-how-vehicles-go-on.md). The bounds keep the worst
 // tracks plausible; they were chosen by hand and not varied.
 /// Correlation time of errors of position, seconds.
 const MEMORY_S: f64 = 0.6;
-/// The same for errors of heading.
-const HEADING_MEMORY_S: f64 = 0.2;
 /// The same for errors of velocity.
 const VELOCITY_MEMORY_S: f64 = 0.18;
 /// Largest error of a velocity, m/s.
 const MOST_VELOCITY: f64 = 1.2;
 /// Largest error of a heading, radians.
 const MOST_HEADING: f64 = 0.5;
-/// Of the error along the path of a vehicle that moves, the share across it: second differences over 0.1 s
-/// are 0.018 and 0.006 m in recordings (medians).
-const ACROSS: f64 = 0.35;
 /// The worst errors of heading, as a multiple of the typical ones.
 const WORST_HEADING: f64 = 3.0;
 /// Share of standing vehicles whose boxes are not exactly still.
@@ -29,10 +25,14 @@ const RESTLESS: f64 = 0.05;
 
 /// Standard deviations of the errors of a kind that moves, for a typical agent.
 struct Level {
-    /// Metres.
+    /// Along the path, metres.
     position: f64,
+    /// Across the path, as a share of that.
+    across: f64,
     /// Radians.
     heading: f64,
+    /// Correlation time of errors of heading, seconds.
+    heading_memory_s: f64,
     /// Metres per second.
     velocity: f64,
     /// Standard deviation of the logarithm of all these over agents: a few are much worse than
@@ -43,20 +43,26 @@ struct Level {
 fn level(kind: AgentKind) -> Level {
     match kind {
         AgentKind::Pedestrian => Level {
-            position: 0.025,
-            heading: 0.03,
+            position: 0.019,
+            across: 1.0,
+            heading: 0.014,
+            heading_memory_s: 0.6,
             velocity: 0.09,
             spread: 0.8,
         },
         AgentKind::Bicycle => Level {
             position: 0.03,
+            across: 1.0,
             heading: 0.012,
+            heading_memory_s: 0.6,
             velocity: 0.3,
             spread: 0.6,
         },
         _ => Level {
             position: 0.03,
+            across: 0.35,
             heading: 0.002,
+            heading_memory_s: 0.2,
             velocity: 0.13,
             spread: 1.0,
         },
@@ -99,7 +105,7 @@ impl Noise {
     pub(super) fn step(&mut self, agent: &Agent, distance: f64, dt: f64) -> Agent {
         let slow = (-dt / MEMORY_S).exp();
         let fast = (-dt / VELOCITY_MEMORY_S).exp();
-        let turning = (-dt / HEADING_MEMORY_S).exp();
+        let turning = (-dt / self.level.heading_memory_s).exp();
         let rng = &mut self.rng;
         let mut vector = || DVec2::new(standard_normal(rng), standard_normal(rng));
         self.position = self.position * slow + vector() * (1.0 - slow * slow).sqrt();
@@ -124,27 +130,18 @@ impl Noise {
         let scale = self.scale * far * still;
         let Level {
             position,
+            across,
             heading,
             velocity,
             ..
         } = self.level;
         let pose = agent.state.pose;
-        let is_vehicle = agent.kind == AgentKind::Vehicle;
-        let uncertain = match is_vehicle {
-            true => scale.min(WORST_HEADING),
-            false => scale,
-        };
-        let turned =
-            (self.heading * heading * uncertain * unsure).clamp(-MOST_HEADING, MOST_HEADING);
+        let turned = self.heading * heading * scale.min(WORST_HEADING) * unsure;
+        let turned = turned.clamp(-MOST_HEADING, MOST_HEADING);
         let pushed = (self.velocity * velocity * scale).clamp_length_max(MOST_VELOCITY);
         // Places are known better than speeds: paths do not wave however bad the velocity.
-        let across = match is_vehicle && !stands(agent) {
-            true => ACROSS,
-            false => 1.0,
-        };
-        let error = self.position * position * scale.min(2.0);
-        let error = pose.rotate(DVec2::new(error.x, across * error.y));
-        let moved = error.clamp_length_max(0.3);
+        let error = self.position * DVec2::new(1.0, across) * position * scale.min(2.0);
+        let moved = pose.rotate(error).clamp_length_max(0.3);
         let state = AgentState {
             pose: gump_geometry::Pose {
                 position: pose.position + moved,
