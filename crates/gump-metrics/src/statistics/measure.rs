@@ -20,6 +20,20 @@ pub enum Statistic {
     Acceleration,
     /// Absolute yaw rate of moving agents, rad/s.
     YawRate,
+    /// Change of speed within 4 s of agents from 1 to 4 m/s, m/s.
+    SpeedChange1To4,
+    /// Change of speed within 4 s of agents from 4 to 8 m/s, m/s.
+    SpeedChange4To8,
+    /// Change of speed within 4 s of agents from 8 to 12 m/s, m/s.
+    SpeedChange8To12,
+    /// Change of speed within 4 s of agents from 12 to 16 m/s, m/s.
+    SpeedChange12To16,
+    /// Change of speed within 4 s of agents from 16 to 22 m/s, m/s.
+    SpeedChange16To22,
+    /// Change of speed within 4 s of agents above 22 m/s, m/s.
+    SpeedChangeAbove22,
+    /// Absolute turn within 1 s of agents above 14 m/s, radians.
+    FastTurn,
     /// Gap to the agent ahead in the same direction within 50 m, of agents on a lane, m.
     Gap,
     /// Length of a track's box, m.
@@ -88,7 +102,7 @@ pub enum Statistic {
 
 impl Statistic {
     /// Every measure.
-    pub const ALL: [Self; 40] = [
+    pub const ALL: [Self; 47] = [
         Self::Standing,
         Self::Parked,
         Self::ParkedOffLane,
@@ -97,6 +111,13 @@ impl Statistic {
         Self::Speed,
         Self::Acceleration,
         Self::YawRate,
+        Self::SpeedChange1To4,
+        Self::SpeedChange4To8,
+        Self::SpeedChange8To12,
+        Self::SpeedChange12To16,
+        Self::SpeedChange16To22,
+        Self::SpeedChangeAbove22,
+        Self::FastTurn,
         Self::Gap,
         Self::Length,
         Self::Width,
@@ -142,6 +163,13 @@ impl Statistic {
             Self::Speed => "speed",
             Self::Acceleration => "acceleration",
             Self::YawRate => "yaw_rate",
+            Self::SpeedChange1To4 => "speed_change_1_to_4",
+            Self::SpeedChange4To8 => "speed_change_4_to_8",
+            Self::SpeedChange8To12 => "speed_change_8_to_12",
+            Self::SpeedChange12To16 => "speed_change_12_to_16",
+            Self::SpeedChange16To22 => "speed_change_16_to_22",
+            Self::SpeedChangeAbove22 => "speed_change_above_22",
+            Self::FastTurn => "fast_turn",
             Self::Gap => "gap",
             Self::Length => "length",
             Self::Width => "width",
@@ -202,6 +230,13 @@ impl Statistic {
             Self::Speed | Self::EgoSpeed => (0.0, 30.0, 60),
             Self::Acceleration => (-6.0, 6.0, 60),
             Self::YawRate => (0.0, 1.0, 100),
+            Self::SpeedChange1To4
+            | Self::SpeedChange4To8
+            | Self::SpeedChange8To12
+            | Self::SpeedChange12To16
+            | Self::SpeedChange16To22
+            | Self::SpeedChangeAbove22 => (-20.0, 20.0, 80),
+            Self::FastTurn => (0.0, 0.2, 80),
             Self::Gap => (0.0, 50.0, 50),
             Self::Length => (0.0, 16.0, 64),
             Self::Width => (0.0, 4.0, 40),

@@ -220,6 +220,37 @@ mod tests {
     }
 
     #[test]
+    fn what_follows_is_counted_by_the_speed_before() {
+        let mut scenario = gump_scene::fixture::scenario(
+            "lane 1: 0,0 300,0
+             ego vehicle 0: 10,0.5 velocity 15,0
+             agent vehicle 1: 30,0.5 velocity 2,0
+             agent vehicle 2: 40,4
+             history 1 future 5 dt 0.1",
+        )
+        .unwrap();
+        // The ego loses half a metre per second and turns by 0.01 in each tenth of a second.
+        for (step, frame) in scenario.log.iter_mut().enumerate() {
+            let mut agents = frame.agents().to_vec();
+            agents[0].state.velocity.x -= 0.05 * step as f64;
+            agents[0].state.pose.heading -= 0.01 * step as f64;
+            *frame = gump_scene::Frame::new(agents, Vec::new());
+        }
+        let mut statistics = Statistics::default();
+        statistics.add(&scenario);
+        // Six seconds, so that there are changes from three starts, and turns from the two seconds
+        // in which the ego is still faster than 14 m/s and one in which it has just that speed.
+        let n = |measure| statistics.get(measure, VEHICLE).map(Distribution::n);
+        assert_eq!(n(M::SpeedChange12To16), Some(3));
+        assert_eq!(n(M::SpeedChange1To4), Some(3));
+        assert_eq!(n(M::SpeedChange4To8), None);
+        let follows = |measure| mean(&statistics, measure, VEHICLE);
+        assert!((follows(M::SpeedChange12To16) + 2.0).abs() < 1e-9);
+        assert_eq!(follows(M::SpeedChange1To4), 0.0);
+        assert!((follows(M::FastTurn) - 0.1).abs() < 1e-9);
+    }
+
+    #[test]
     fn parts_add_up_and_rows_are_all_there_is() {
         let texts = [
             "ego vehicle 0: 0,0 velocity 5,0",

@@ -23,6 +23,21 @@ const LONG_ENOUGH_S: f64 = 2.0;
 const LOOK_EVERY_S: f64 = 1.0;
 /// Metres around the ego in which an agent is near.
 const NEAR: f64 = 60.0;
+/// How far ahead changes of speed look, seconds.
+const CHANGE_S: f64 = 4.0;
+/// Over how long fast turns are measured, seconds.
+const TURN_S: f64 = 1.0;
+/// Fast turns are those of faster agents, m/s.
+const FAST: f64 = 14.0;
+/// Speeds at which the classes of changes of speed begin, m/s.
+const SPEED_CLASSES: [(f64, M); 6] = [
+    (1.0, M::SpeedChange1To4),
+    (4.0, M::SpeedChange4To8),
+    (8.0, M::SpeedChange8To12),
+    (12.0, M::SpeedChange12To16),
+    (16.0, M::SpeedChange16To22),
+    (22.0, M::SpeedChangeAbove22),
+];
 /// Interval of jitter measurements, independent of the frame rate, seconds.
 const JITTER_S: f64 = 0.1;
 
@@ -91,6 +106,7 @@ fn note_track(scenario: &Scenario, track: &Track<'_>, is_ego: bool, statistics: 
         }
     }
     note_steps(scenario.dt, track, parked, statistics);
+    note_what_follows(scenario, track, statistics);
     let stride = (LOOK_EVERY_S / scenario.dt).round().max(1.0) as usize;
     let looked_at = track
         .iter()
@@ -130,6 +146,31 @@ fn note_steps(dt: f64, track: &Track<'_>, parked: bool, statistics: &mut Statist
         let turned = angle_difference(after.heading, before.heading).abs();
         statistics.note(M::Jitter, class, moved * per_step);
         statistics.note(M::HeadingJitter, class, turned * per_step);
+    }
+}
+
+/// Records how the speed of an agent of a given speed changes, and how much fast agents turn. Means
+/// over all steps say nothing of this: a set in which everyone speeds up and brakes has the mean
+/// speed of one in which everyone keeps it.
+fn note_what_follows(scenario: &Scenario, track: &Track<'_>, statistics: &mut Statistics) {
+    let class: StatisticClass = Some(track[0].1.kind);
+    let steps = |seconds: f64| (seconds / scenario.dt).round().max(1.0) as usize;
+    let (change, turn, stride) = (steps(CHANGE_S), steps(TURN_S), steps(LOOK_EVERY_S));
+    for (i, (step, agent)) in track.iter().enumerate() {
+        if step % stride != scenario.now % stride {
+            continue;
+        }
+        // Only where the agent is present all along.
+        let after = |n: usize| track.get(i + n).filter(|later| later.0 == step + n);
+        let speed = agent.state.speed();
+        let of_speed = SPEED_CLASSES.iter().rfind(|(from, _)| speed >= *from);
+        if let Some(((_, measure), (_, later))) = of_speed.zip(after(change)) {
+            statistics.note(*measure, class, later.state.speed() - speed);
+        }
+        if let Some((_, later)) = after(turn).filter(|_| speed >= FAST) {
+            let [from, to] = [agent, later].map(|agent| agent.state.pose.heading);
+            statistics.note(M::FastTurn, class, angle_difference(to, from).abs());
+        }
     }
 }
 
