@@ -43,11 +43,11 @@ const STREET_SPEED: f64 = 10.0;
 /// Factors on the limits of plain plans, and the share of arterials that get nothing beside the road.
 /// Fitted to how vehicles of each speed go on (result 49): who drives at 16 to 22 m/s in a recording has
 /// lost 0.2 m/s after 4 s (median), and a tenth has lost more than 2.5 m/s.
-const FREEWAYS: Range<f64> = 1.0..1.5;
+const FREEWAYS: Range<f64> = 1.0..1.6;
 const WIDE_ROADS: Range<f64> = 0.75..1.05;
 const STREETS: Range<f64> = 0.7..1.1;
-const OPEN: f64 = 0.45;
-const OPEN_ROADS: Range<f64> = 0.85..1.15;
+const OPEN: f64 = 0.65;
+const OPEN_ROADS: Range<f64> = 1.0..1.4;
 /// Aisles leave their road within this of a right angle, radians.
 const SLANT: f64 = 0.3;
 

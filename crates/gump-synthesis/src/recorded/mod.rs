@@ -36,15 +36,15 @@ use crate::{RoadFamily, SynthesisConfig};
 /// Weights of the families: recordings are made in towns, rarely on motorways. Fitted by hand in
 /// several rounds, towards traffic as fast as recorded one.
 const FAMILIES: [(RoadFamily, u32); 9] = [
-    (RoadFamily::SignalizedCrossing, 8),
-    (RoadFamily::StopCrossing, 12),
+    (RoadFamily::SignalizedCrossing, 28),
+    (RoadFamily::StopCrossing, 18),
     (RoadFamily::TeeJunction, 6),
     (RoadFamily::Roundabout, 2),
-    (RoadFamily::Arterial, 54),
-    (RoadFamily::CurvedRoad, 14),
-    (RoadFamily::OnRamp, 24),
+    (RoadFamily::Arterial, 48),
+    (RoadFamily::CurvedRoad, 12),
+    (RoadFamily::OnRamp, 30),
     (RoadFamily::MidBlockCrosswalk, 6),
-    (RoadFamily::Grid, 8),
+    (RoadFamily::Grid, 14),
 ];
 // Some formats state no limits, signs or lights (docs/decisions/0014-unknown-inputs.md). The shares
 // are chosen by hand, so that a network meets both.
@@ -62,7 +62,9 @@ const CLOSED_MOUTHS: f64 = 0.6;
 /// Roads with a higher limit are wide and carry more traffic, m/s; with one that is higher still it flows,
 /// past ramps, too. Chosen by hand.
 const WIDE_ROAD_SPEED: f64 = 15.0;
-const FREEWAY_SPEED: f64 = 21.5;
+const FREEWAY_SPEED: f64 = 19.0;
+/// With one that is higher than this it flows freely.
+const FREE_FLOW: f64 = 26.0;
 /// Metres from the centre of the scene within which the ego is chosen: with the
 /// 79 m that its tracker sees, this stays within the 150 m that roads reach.
 const EGO_REACH: f64 = 60.0;
@@ -169,9 +171,10 @@ fn draw_demand(
     let most = ((metres / 24.0) as usize).max(1);
     let fastest = network.lanes.iter().map(|lane| lane.speed_limit);
     let busy = match fastest.fold(0.0, f64::max) {
-        FREEWAY_SPEED.. => 0.8,
+        FREE_FLOW.. => 0.7,
+        FREEWAY_SPEED.. => 0.9,
         WIDE_ROAD_SPEED.. => 1.5,
-        _ => 0.85,
+        _ => 1.2,
     };
     let moving = draw_skewed(&config.vehicles, 1.3, busy * config.density, rng).clamp(1, most);
     // How busy people and parking are goes together.

@@ -124,7 +124,7 @@ impl Noise {
         };
         // The heading of a standing person is hard to measure.
         let unsure = match (stands(agent), agent.kind) {
-            (true, AgentKind::Pedestrian | AgentKind::Bicycle) => 4.0,
+            (true, AgentKind::Pedestrian | AgentKind::Bicycle) => 12.0,
             _ => 1.0,
         };
         let scale = self.scale * far * still;

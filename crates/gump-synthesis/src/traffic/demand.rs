@@ -17,6 +17,8 @@ use crate::plan::CAR_PARK_SPEED;
 const LONGEST_PATH: usize = 40;
 /// Sideways metres that a long vehicle may sweep beside its centre line. Chosen by eye.
 const SWEEP: f64 = 0.55;
+/// Vehicles of scenes like recorded ones enter at this share of the speed that they may drive, at least.
+const ENTERS_AT: f64 = 0.9;
 
 /// Numbers of agents in a scene.
 #[derive(Clone, Debug)]
@@ -277,12 +279,18 @@ impl TrafficSimulation<'_> {
         let id = self.next_id;
         let mut vehicle = Vehicle::new(id, (kind, size, driver), path, s, 0.0, &mut self.rng);
         let to_line = (l.length() - vehicle.front()).max(0.0);
-        let speed = vehicle
-            .allowed_speed(network)
-            .min((2.0 * 1.2 * to_line).sqrt());
+        let is_real = self.demand.scenery.is_real;
+        // Nobody has to stop where a lane of a freeway goes on.
+        let goes_on = is_real && freeway && !l.successors.is_empty();
+        let stops = match goes_on {
+            true => f64::INFINITY,
+            false => (2.0 * 1.2 * to_line).sqrt(),
+        };
+        let speed = vehicle.allowed_speed(network).min(stops);
         // Queries need an up-to-date picture; newcomers are few.
         self.occupancy.fill(network, &self.vehicles);
-        let mut speed = speed * self.rng.random_range(0.8..1.0);
+        let slowest = if is_real { ENTERS_AT } else { 0.8 };
+        let mut speed = speed * self.rng.random_range(slowest..1.0);
         for entry in self.occupancy.on(lane) {
             let gap_ahead = entry.rear - vehicle.front();
             let gap_behind = s - size[0] / 2.0 - entry.front;
@@ -307,7 +315,7 @@ impl TrafficSimulation<'_> {
             };
             vehicle.settle(-(l.width / 2.0 - 0.55).min(most));
         }
-        if self.demand.scenery.is_real && kind == AgentKind::Vehicle {
+        if is_real && kind == AgentKind::Vehicle {
             // Hardly anybody drives in the very middle of the lane.
             let room = (l.width / 2.0 - vehicle.width() / 2.0 - 0.1).clamp(0.0, 0.8);
             let part: f64 = self.rng.random_range(-1.0..1.0);
