@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::f64::consts::FRAC_PI_2;
 use std::ops::Range;
 
-use gump_geometry::{Pose, angle_difference, wrap_angle};
+use gump_geometry::{DVec2, Pose, angle_difference, wrap_angle};
 use gump_scene::Rng;
 use rand::Rng as _;
 
@@ -43,16 +43,22 @@ const STREET_SPEED: f64 = 10.0;
 /// Factors on the limits of plain plans, and the share of arterials that get nothing beside the road.
 /// Fitted to how vehicles of each speed go on (result 49): who drives at 16 to 22 m/s in a recording has
 /// lost 0.2 m/s after 4 s (median), and a tenth has lost more than 2.5 m/s.
-const FREEWAYS: Range<f64> = 1.0..1.6;
+const FREEWAYS: Range<f64> = 1.1..1.7;
 const WIDE_ROADS: Range<f64> = 0.75..1.05;
 const STREETS: Range<f64> = 0.7..1.1;
 const OPEN: f64 = 0.65;
 const OPEN_ROADS: Range<f64> = 1.0..1.4;
+/// Share of freeways whose other carriageway is there, too, and metres between the two.
+const BOTH_WAYS: f64 = 0.75;
+const CENTRAL_RESERVE: Range<f64> = 2.5..12.0;
 /// Aisles leave their road within this of a right angle, radians.
 const SLANT: f64 = 0.3;
 
 /// Adds side roads and car parks, then decides along which roads vehicles park.
 pub(crate) fn dress(plan: &mut Plan, extent: f64, rng: &mut Rng) {
+    if plan.roads[0].freeway && rng.random_bool(BOTH_WAYS) {
+        add_other_carriageway(plan, rng);
+    }
     let is_arterial = |plan: &Plan| plan.nodes.is_empty() && plan.roads[0].forward > 1;
     if is_arterial(plan) && rng.random_bool(OPEN) {
         allow_parking(plan, rng);
@@ -84,6 +90,24 @@ fn change_limits(plan: &mut Plan, factors: [Range<f64>; 3], rng: &mut Rng) {
             _ => wide,
         };
     }
+}
+
+/// Adds the carriageway in the other direction, on the left of a freeway with one ramp.
+fn add_other_carriageway(plan: &mut Plan, rng: &mut Rng) {
+    let apart = rng.random_range(CENTRAL_RESERVE);
+    let main = plan.roads.iter().filter(|road| road.freeway && road.major);
+    let beside = main.flat_map(|road| {
+        let track = &road.reference;
+        let n = (track.length() / 5.0) as usize;
+        (0..n).map(|i| track.pose_at(5.0 * i as f64) * DVec2::new(0.0, apart))
+    });
+    let mut points: Vec<DVec2> = beside.collect();
+    points.reverse();
+    plan.roads.push(RoadPlan {
+        reference: Track::through(&points),
+        ends: [None, None],
+        ..plan.roads[0].clone()
+    });
 }
 
 type Adds = fn(&mut Plan, (usize, f64, bool), f64, &mut Rng) -> bool;

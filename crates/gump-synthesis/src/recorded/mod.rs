@@ -36,7 +36,7 @@ use crate::{RoadFamily, SynthesisConfig};
 /// Weights of the families: recordings are made in towns, rarely on motorways. Fitted by hand in
 /// several rounds, towards traffic as fast as recorded one.
 const FAMILIES: [(RoadFamily, u32); 9] = [
-    (RoadFamily::SignalizedCrossing, 28),
+    (RoadFamily::SignalizedCrossing, 32),
     (RoadFamily::StopCrossing, 18),
     (RoadFamily::TeeJunction, 6),
     (RoadFamily::Roundabout, 2),
@@ -171,7 +171,7 @@ fn draw_demand(
     let most = ((metres / 24.0) as usize).max(1);
     let fastest = network.lanes.iter().map(|lane| lane.speed_limit);
     let busy = match fastest.fold(0.0, f64::max) {
-        FREE_FLOW.. => 0.7,
+        FREE_FLOW.. => 1.0,
         FREEWAY_SPEED.. => 0.9,
         WIDE_ROAD_SPEED.. => 1.5,
         _ => 1.2,
