@@ -346,7 +346,7 @@ fn is_clear(plan: &Plan, from: usize, reference: &Track, half_width: f64) -> boo
         } else {
             0.0
         };
-        let far = |point: &gump_geometry::DVec2| {
+        let far = |point: &DVec2| {
             let foot = other.reference.project(*point);
             other.reference.pose_at(foot).position.distance(*point) > apart
         };
