@@ -238,8 +238,7 @@ mod tests {
         }
         let mut statistics = Statistics::default();
         statistics.add(&scenario);
-        // Six seconds, so that there are changes from three starts, and turns from the two seconds
-        // in which the ego is still faster than 14 m/s and one in which it has just that speed.
+        // Six seconds, so that there are changes from three starts; the ego is below 14 m/s after two.
         let n = |measure| statistics.get(measure, VEHICLE).map(Distribution::n);
         assert_eq!(n(M::SpeedChange12To16), Some(3));
         assert_eq!(n(M::SpeedChange1To4), Some(3));

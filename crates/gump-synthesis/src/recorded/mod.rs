@@ -63,7 +63,7 @@ const CLOSED_MOUTHS: f64 = 0.6;
 /// past ramps, too. Chosen by hand.
 const WIDE_ROAD_SPEED: f64 = 15.0;
 const FREEWAY_SPEED: f64 = 19.0;
-/// With one that is higher than this it flows freely.
+/// With one that is higher than this it is a freeway, in most scenes of two carriageways.
 const FREE_FLOW: f64 = 26.0;
 /// Metres from the centre of the scene within which the ego is chosen: with the
 /// 79 m that its tracker sees, this stays within the 150 m that roads reach.
