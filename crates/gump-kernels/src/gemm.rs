@@ -8,6 +8,8 @@
     reason = "`gemm::gemm` takes raw pointers, which are checked here, once"
 )]
 
+use std::sync::OnceLock;
+
 use gemm::Parallelism;
 
 use crate::kernels;
@@ -168,6 +170,13 @@ enum Form<'a> {
     Packed(kernels::Packed),
 }
 
+impl Right<'static> {
+    /// Rounds the matrix and packs it.
+    pub fn packed(rhs: Mat<'_>) -> Self {
+        Self(Form::Packed(kernels::Packed::new(rhs)))
+    }
+}
+
 impl<'a> Right<'a> {
     /// Packs the matrix if its operands are to be rounded.
     pub fn new(rhs: Mat<'a>, operands: Operands) -> Self {
@@ -204,6 +213,69 @@ impl<'a> Right<'a> {
     }
 }
 
+/// `lhs rhs` in new memory, `[m, n]`, plus `row` `[n]` in every row if there is one.
+///
+/// `packed` keeps the right matrix for the next product with it, if its operands are rounded; the
+/// bits are those of [`gemm()`] either way.
+///
+/// Panics when the shapes do not fit.
+pub fn fresh_product(
+    lhs: Mat<'_>,
+    (rhs, packed): (Mat<'_>, Option<&OnceLock<Right<'static>>>),
+    row: Option<&[f32]>,
+    threads: Threads,
+    operands: Operands,
+) -> Vec<f32> {
+    assert_eq!(lhs.cols, rhs.rows, "inner size of the product");
+    let fits = row.is_none_or(|row| row.len() == rhs.cols);
+    assert!(fits, "a row as wide as the product");
+    let rounds = operands == Operands::Bf16;
+    if !rounds || !kernels::is_worthwhile(lhs.rows, lhs.cols, rhs.cols) {
+        return f32_fresh_product(lhs, rhs, row, threads);
+    }
+    let once = OnceLock::new();
+    let right = packed.unwrap_or(&once).get_or_init(|| Right::packed(rhs));
+    match &right.0 {
+        Form::Packed(packed) => packed.fresh_product(lhs, row, threads),
+        Form::Plain(_) => unreachable!("it was packed"),
+    }
+}
+
+/// [`fresh_product`] of the numbers as they are; the shapes fit.
+pub(crate) fn f32_fresh_product(
+    lhs: Mat<'_>,
+    rhs: Mat<'_>,
+    row: Option<&[f32]>,
+    threads: Threads,
+) -> Vec<f32> {
+    let (m, n) = (lhs.rows, rhs.cols);
+    let mut product = Vec::with_capacity(m * n);
+    match row {
+        Some(row) => {
+            (0..m).for_each(|_| product.extend_from_slice(row));
+            let dst = MatMut::new(&mut product, m, n);
+            f32_product(dst, Store::Add, 1.0, lhs, rhs, threads);
+        }
+        None if lhs.cols == 0 => product.resize(m * n, 0.0),
+        None => {
+            // SAFETY: there is room for `m` rows of `n` numbers, `product` is not shared, and with
+            // `Replace` and at least one inner index all of them are written and none is read.
+            unsafe {
+                multiply(
+                    (product.as_mut_ptr(), n),
+                    Store::Replace,
+                    1.0,
+                    lhs,
+                    rhs,
+                    threads,
+                );
+                product.set_len(m * n);
+            }
+        }
+    }
+    product
+}
+
 /// [`gemm()`] of the numbers as they are; the shapes fit.
 pub fn f32_product(
     dst: MatMut<'_>,
@@ -214,20 +286,38 @@ pub fn f32_product(
     threads: Threads,
 ) {
     let MatMut {
-        data,
-        rows,
-        cols,
-        row_stride,
+        data, row_stride, ..
     } = dst;
+    // SAFETY: the constructor checked that every (row, column) lies in the slice of `dst` and that
+    // its rows are disjoint; it is a unique borrow, so it overlaps neither operand.
+    unsafe {
+        let to = (data.as_mut_ptr(), row_stride);
+        multiply(to, store, scale, lhs, rhs, threads);
+    }
+}
+
+/// The product by the matrix library, to rows of the pointer that are so far apart.
+///
+/// # Safety
+/// There is room for the rows of `lhs` with the columns of `rhs`, which overlaps neither and is used
+/// by no one else; the numbers there may be read unless they are replaced.
+unsafe fn multiply(
+    (to, row_stride): (*mut f32, usize),
+    store: Store,
+    scale: f32,
+    lhs: Mat<'_>,
+    rhs: Mat<'_>,
+    threads: Threads,
+) {
     let stride = |s: usize| isize::try_from(s).expect("a stride is within a slice");
-    // SAFETY: the three constructors checked that every (row, column) lies in its slice and that
-    // the rows of `dst` are disjoint; `dst` is a unique borrow, so it overlaps neither operand.
+    // SAFETY: as the function's; the constructors of both operands checked that every (row, column)
+    // lies in its slice.
     unsafe {
         gemm::gemm(
-            rows,
-            cols,
+            lhs.rows,
+            rhs.cols,
             lhs.cols,
-            data.as_mut_ptr(),
+            to,
             1,
             stride(row_stride),
             store == Store::Add,

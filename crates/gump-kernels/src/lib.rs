@@ -5,7 +5,7 @@
 //! products ([`panels`]), attention in bfloat16 ([`half_pages`]), sums in a fixed order ([`rows`]),
 //! and the row-wise parts of layers that training and inference share ([`gelu`], [`gru`], [`norm`],
 //! [`edge_attention`]). What does not: tensors, gradients and layers, which are `gump-nn`'s. All
-//! `unsafe` of the workspace is in `gemm` and `kernels`.
+//! `unsafe` of the workspace is in `gemm`, `fresh` and `kernels`.
 //!
 //! Results are bit-identical for any number of threads: work is cut by shape, and sums are added in
 //! a fixed order.
@@ -23,6 +23,7 @@
 
 pub mod edge_attention;
 mod error;
+mod fresh;
 pub mod gelu;
 pub mod gemm;
 pub mod gru;
@@ -41,5 +42,6 @@ pub mod smoothing;
 mod testing;
 
 pub use error::KernelError;
+pub use fresh::fresh_pieces;
 pub use kernels::{Choice, Kernel, tile, wide};
 pub use operands::Operands;

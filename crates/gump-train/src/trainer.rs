@@ -17,7 +17,7 @@ use gump_model::Network;
 use gump_model::checkpoint::{self, StorageType};
 use gump_model::config::ModelConfig;
 use gump_nn::layers::Dropout;
-use gump_nn::ops::Deferred;
+use gump_nn::ops::{Deferred, PackedWeights};
 
 use crate::closed_loop_samples;
 use crate::config::TrainConfig;
@@ -262,7 +262,7 @@ impl Trainer {
         let whole = self.total(Counts::of(samples, &self.config.loss))?;
         let seed = Seed(self.config.seed).fork(2);
         let seed = seed.fork(self.learner.step as u64);
-        let mut found = BatchGradients::default();
+        let (mut found, packed) = (BatchGradients::default(), PackedWeights::default());
         let part = samples.len().div_ceil(self.config.accumulate).max(1);
         for (i, samples) in samples.chunks(part).enumerate() {
             let seed = seed.fork((i * self.group.size() + self.group.rank()) as u64);
@@ -271,7 +271,7 @@ impl Trainer {
                 let dropout = Dropout::new(network.config().dropout, seed.fork(j as u64));
                 let deferred = Deferred::default();
                 let build = || loss(network, samples, config, &whole, true, dropout.as_ref());
-                let (total, loss) = operands.during(|| deferred.during(build))?;
+                let (total, loss) = operands.during(|| packed.during(|| deferred.during(build)))?;
                 let tokens = samples.iter().map(|sample| sample.slots.len()).sum();
                 Ok(Part {
                     gradients: total.backward()?,

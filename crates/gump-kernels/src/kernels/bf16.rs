@@ -14,6 +14,7 @@ use std::cell::RefCell;
 
 use rayon::prelude::*;
 
+use crate::fresh::fresh_pieces;
 use crate::gemm::{Mat, MatMut, Store, Threads};
 use crate::panels::PANEL;
 use crate::rows::{exp_shifted_sum, max};
@@ -200,6 +201,36 @@ impl Right {
         self.pieces.iter().map(Pairs::bytes).sum()
     }
 
+    /// As [`super::Packed::fresh_product`].
+    pub(super) fn fresh_product<U: Unit>(
+        &self,
+        unit: U,
+        lhs: Mat<'_>,
+        row: Option<&[f32]>,
+        threads: Threads,
+    ) -> Vec<f32> {
+        let (lhs, columns) = (Lanes::of_rows(lhs), self.columns);
+        assert_eq!(lhs.depth, self.depth, "inner size of the product");
+        let threads = shared(threads, lhs.lanes, columns, lhs.depth);
+        let (len, at_once) = (lhs.lanes * columns, (ROWS_AT_ONCE * columns).max(1));
+        fresh_pieces(len, at_once, row, threads, |chunk, data| {
+            let first = chunk * ROWS_AT_ONCE;
+            let mut to = Target {
+                data,
+                stride: columns,
+                rows: ROWS_AT_ONCE.min(lhs.lanes - first),
+                columns,
+                store: row.map_or(Store::Replace, |_| Store::Add),
+                scale: 1.0,
+            };
+            for (piece, panels) in depths(self.depth).zip(&self.pieces) {
+                let panels = (panels.all(), U::pairs(piece.1));
+                rows_product(unit, lhs.part((first, to.rows), piece), panels, &mut to);
+                to.store = Store::Add;
+            }
+        })
+    }
+
     /// As [`super::Packed::product`].
     pub(super) fn product<U: Unit>(
         &self,
@@ -249,6 +280,12 @@ pub(super) fn product<U: Unit>(
     RIGHT.set(right);
 }
 
+/// The threads for a product of this size.
+fn shared(threads: Threads, rows: usize, columns: usize, depth: usize) -> Threads {
+    let is_worth_it = rows > ROWS_AT_ONCE && rows * columns * depth >= SHARED_PRODUCTS;
+    if is_worth_it { threads } else { Threads::One }
+}
+
 /// A product on its way, piece by piece of the depth.
 struct Work<'a> {
     data: &'a mut [f32],
@@ -263,7 +300,6 @@ struct Work<'a> {
 impl<'a> Work<'a> {
     fn new(dst: MatMut<'a>, store: Store, scale: f32, lhs: Lanes<'a>, threads: Threads) -> Self {
         let (data, [rows, columns], stride) = dst.into_parts();
-        let products = rows * columns * lhs.depth;
         // Rows after the last may be part of the slice, but not of the matrix.
         let end = (rows * stride).min(data.len());
         let data = &mut data[..end];
@@ -279,9 +315,7 @@ impl<'a> Work<'a> {
             store,
             scale,
             lhs,
-            is_shared: threads == Threads::Pool
-                && rows > ROWS_AT_ONCE
-                && products >= SHARED_PRODUCTS,
+            is_shared: shared(threads, rows, columns, lhs.depth) == Threads::Pool,
         }
     }
 

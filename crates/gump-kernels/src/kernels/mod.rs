@@ -154,6 +154,25 @@ impl Packed {
         }
     }
 
+    /// `lhs rhs` in new memory, plus `row` in every row if there is one.
+    ///
+    /// Panics when the shapes do not fit.
+    pub(crate) fn fresh_product(
+        &self,
+        lhs: Mat<'_>,
+        row: Option<&[f32]>,
+        threads: Threads,
+    ) -> Vec<f32> {
+        match self {
+            #[cfg(target_arch = "x86_64")]
+            Self::Pairs(right) => match unit().expect("who packed pairs multiplies them") {
+                AnyUnit::Amx(unit) => right.fresh_product(unit, lhs, row, threads),
+                AnyUnit::Avx512Bf16(unit) => right.fresh_product(unit, lhs, row, threads),
+            },
+            Self::Rounded(right) => right.fresh_product(lhs, row, threads),
+        }
+    }
+
     /// `dst (+)= scale * lhs rhs`, where `dst` has the first columns of the matrix, and `lhs` its
     /// first inner indices.
     ///
@@ -327,9 +346,11 @@ impl Pairs {
         Self(Vec::new())
     }
 
-    /// Returns room for `n` pairs, with unspecified contents.
+    /// Returns room for `n` pairs, with unspecified contents. It never shrinks: room given up for a
+    /// small product would be zeroed again for the next large one.
     pub(crate) fn room(&mut self, n: usize) -> &mut [u32] {
-        self.0.resize(n.div_ceil(16), Line([0; 16]));
+        let lines = n.div_ceil(16).max(self.0.len());
+        self.0.resize(lines, Line([0; 16]));
         &mut self.all_mut()[..n]
     }
 

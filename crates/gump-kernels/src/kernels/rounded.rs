@@ -1,7 +1,7 @@
 //! Products of bfloat16 on processors without a unit for them: operands are rounded and multiplied
 //! in f32. As exact as a unit, and no faster than f32.
 
-use crate::gemm::{Mat, MatMut, Store, Threads, f32_product};
+use crate::gemm::{Mat, MatMut, Store, Threads, f32_fresh_product, f32_product};
 
 /// `dst (+)= scale * lhs rhs` of rounded operands.
 pub(super) fn product(
@@ -48,6 +48,20 @@ impl Right {
 
     pub(super) fn bytes(&self) -> usize {
         size_of_val(&self.numbers[..])
+    }
+
+    /// As [`super::Packed::fresh_product`].
+    pub(super) fn fresh_product(
+        &self,
+        lhs: Mat<'_>,
+        row: Option<&[f32]>,
+        threads: Threads,
+    ) -> Vec<f32> {
+        let (_, [rows, depth], _) = lhs.parts();
+        let lhs = rounded(lhs);
+        let lhs = Mat::new(&lhs, rows, depth);
+        let rhs = Mat::new(&self.numbers, depth, self.columns);
+        f32_fresh_product(lhs, rhs, row, threads)
     }
 
     /// As [`super::Packed::product`].

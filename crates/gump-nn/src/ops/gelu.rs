@@ -6,8 +6,9 @@
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor};
 
 use gump_kernels::gelu::normal;
+use gump_kernels::gemm::Threads;
 use gump_kernels::rows::for_pieces;
-use gump_kernels::wide;
+use gump_kernels::{fresh_pieces, wide};
 
 use super::{Host, elements, fusible, gradient, output};
 
@@ -46,8 +47,7 @@ impl CustomOp1 for Gelu {
 
 /// The activation of every number.
 pub(super) fn activated(x: &[f32]) -> Vec<f32> {
-    let mut y = vec![0.0; x.len()];
-    for_pieces(&mut y, PIECE, |i, y| {
+    fresh_pieces(x.len(), PIECE, None, Threads::Pool, |i, y| {
         let x = &x[i * PIECE..];
         wide(
             #[inline(always)]
@@ -57,8 +57,7 @@ pub(super) fn activated(x: &[f32]) -> Vec<f32> {
                 }
             },
         );
-    });
-    y
+    })
 }
 
 /// Turns the gradient of the activations into that of the numbers `x`.

@@ -15,7 +15,7 @@ use gump_kernels::wide;
 use super::attention::{Attention, Inputs, View, causal_self_attention, cross_attention};
 use super::carried::{Operation, apply};
 use super::gelu::{activated, gelu, slope};
-use super::linear::{Linear, bias_gradient, linear};
+use super::linear::{Linear, bias_gradient, linear, parameter};
 use super::norm::{gradients, layer_norm, normalized};
 use super::{Host, fusible, gradient};
 
@@ -312,7 +312,8 @@ impl OwnAffine {
         let weight = Host::new(&self.weight)?;
         let bias = self.bias.as_ref().map(Host::new).transpose()?;
         let bias = bias.as_ref().map(|bias| bias.slice()).transpose()?;
-        Ok(linear.multiply(x, weight.slice()?, self.weight.dims2()?, bias))
+        let named = (weight.slice()?, parameter(&self.weight));
+        Ok(linear.multiply(x, named, self.weight.dims2()?, bias))
     }
 
     /// The gradient of `x`; those of matrix and bias are put last in `others`.

@@ -3,12 +3,15 @@
 //! What lives here: the fused operation, whose gradients never copy a transposed matrix. What does
 //! not: the parameters, which the network holds.
 
-use candle_core::{CpuStorage, CustomOp2, CustomOp3, D, DType, Layout, Result, Shape, Tensor};
+use candle_core::{
+    CpuStorage, CustomOp2, CustomOp3, D, DType, Layout, Result, Shape, Tensor, TensorId,
+};
 
 use super::deferred::{Deferred, Part};
+use super::packed::{PackedWeights, Side};
 use super::{Host, elements, fusible, gradient, output};
 use gump_kernels::Operands;
-use gump_kernels::gemm::{Mat, MatMut, Store, Threads, gemm};
+use gump_kernels::gemm::{Mat, Threads, fresh_product};
 use gump_kernels::rows::column_sums;
 
 /// `x weight^T + bias`.
@@ -28,12 +31,13 @@ pub fn linear(x: &Tensor, weight: &Tensor, bias: Option<&Tensor>) -> Result<Tens
     }
     match bias {
         Some(bias) if fusible(&[x, weight, bias]) => {
+            let op = Linear::of(weight);
             x.contiguous()?
-                .apply_op3(&weight.contiguous()?, &bias.contiguous()?, Linear::now())
+                .apply_op3(&weight.contiguous()?, &bias.contiguous()?, op)
         }
         None if fusible(&[x, weight]) => x
             .contiguous()?
-            .apply_op2(&weight.contiguous()?, Linear::now()),
+            .apply_op2(&weight.contiguous()?, Linear::of(weight)),
         _ => composed(x, weight, bias),
     }
 }
@@ -72,6 +76,9 @@ fn composed(x: &Tensor, weight: &Tensor, bias: Option<&Tensor>) -> Result<Tensor
 pub(super) struct Linear {
     operands: Operands,
     deferred: Option<Deferred>,
+    packed: Option<PackedWeights>,
+    /// The matrix of the operation [`linear`], if it is a parameter.
+    weight: Option<TensorId>,
 }
 
 impl Linear {
@@ -80,8 +87,23 @@ impl Linear {
         Self {
             operands: Operands::current(),
             deferred: Deferred::current(),
+            packed: PackedWeights::current(),
+            weight: None,
         }
     }
+
+    /// The same for one matrix.
+    fn of(weight: &Tensor) -> Self {
+        Self {
+            weight: parameter(weight),
+            ..Self::now()
+        }
+    }
+}
+
+/// What a matrix is known by, if it is a parameter: other tensors do not outlive a sample.
+pub(super) fn parameter(weight: &Tensor) -> Option<TensorId> {
+    weight.is_variable().then(|| weight.id())
 }
 
 impl CustomOp2 for Linear {
@@ -173,36 +195,36 @@ impl Linear {
         let sizes = weight_layout.shape().dims2()?;
         let mut shape = x_layout.dims().to_vec();
         *shape.last_mut().expect("x has a last axis") = sizes.0;
-        Ok(output(self.multiply(x, weight, sizes, bias), shape))
+        let y = self.multiply(x, (weight, self.weight), sizes, bias);
+        Ok(output(y, shape))
     }
 
-    /// `x weight^T + bias`, of a matrix `[out, in]` with these sizes.
+    /// `x weight^T + bias`, of a matrix `[out, in]` with these sizes, and with this name if it is a
+    /// parameter.
     pub(super) fn multiply(
         &self,
         x: &[f32],
-        weight: &[f32],
+        (weight, name): (&[f32], Option<TensorId>),
         (n_out, n_in): (usize, usize),
         bias: Option<&[f32]>,
     ) -> Vec<f32> {
-        let rows = x.len() / n_in.max(1);
-        let (mut y, store) = match bias {
-            Some(bias) => {
-                let mut y = Vec::with_capacity(rows * n_out);
-                (0..rows).for_each(|_| y.extend_from_slice(bias));
-                (y, Store::Add)
-            }
-            None => (vec![0.0; rows * n_out], Store::Replace),
-        };
-        gemm(
-            MatMut::new(&mut y, rows, n_out),
-            store,
-            1.0,
-            Mat::new(x, rows, n_in),
-            Mat::new(weight, n_out, n_in).t(),
-            Threads::Pool,
-            self.operands,
-        );
-        y
+        let x = Mat::new(x, x.len() / n_in.max(1), n_in);
+        let turned = Mat::new(weight, n_out, n_in).t();
+        self.product(x, (turned, name), Side::Turned, bias)
+    }
+
+    /// `lhs rhs` in new memory, plus `bias` in every row; a parameter is packed once a step.
+    fn product(
+        &self,
+        lhs: Mat<'_>,
+        (rhs, name): (Mat<'_>, Option<TensorId>),
+        side: Side,
+        bias: Option<&[f32]>,
+    ) -> Vec<f32> {
+        let packed = self.packed.as_ref().zip(name);
+        let packed = packed.map(|(packed, name)| packed.of(name, side));
+        let rhs = (rhs, packed.as_deref());
+        fresh_product(lhs, rhs, bias, Threads::Pool, self.operands)
     }
 
     /// Gradients of the input, if it is wanted, and of the matrix, if it is due now.
@@ -221,19 +243,8 @@ impl Linear {
         let rows = x_all.len() / n_in.max(1);
         let dy = Mat::new(dy, rows, n_out);
         let dx = if wants_dx {
-            let mut dx = vec![0.0; x_all.len()];
-            let w = Mat::new(w, n_out, n_in);
-            let dst = MatMut::new(&mut dx, rows, n_in);
-            gemm(
-                dst,
-                Store::Replace,
-                1.0,
-                dy,
-                w,
-                Threads::Pool,
-                self.operands,
-            );
-            Some(dx)
+            let w = (Mat::new(w, n_out, n_in), parameter(weight));
+            Some(self.product(dy, w, Side::Straight, None))
         } else {
             None
         };
@@ -246,18 +257,8 @@ impl Linear {
             deferred.note(weight, part);
             None
         } else if weight.track_op() {
-            let mut dw = vec![0.0; w.len()];
-            let x_all = Mat::new(x_all, rows, n_in);
-            let dst = MatMut::new(&mut dw, n_out, n_in);
-            gemm(
-                dst,
-                Store::Replace,
-                1.0,
-                dy.t(),
-                x_all,
-                Threads::Pool,
-                self.operands,
-            );
+            let x_all = (Mat::new(x_all, rows, n_in), None);
+            let dw = fresh_product(dy.t(), x_all, None, Threads::Pool, self.operands);
             Some(gradient(dw, weight)?)
         } else {
             None

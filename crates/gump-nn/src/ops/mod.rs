@@ -25,6 +25,7 @@ mod half_block;
 mod linear;
 mod loss;
 mod norm;
+mod packed;
 mod pool;
 mod table;
 
@@ -46,6 +47,7 @@ pub use pool::largest_of_nine;
 pub use table::{embedding_sum, table_rows};
 
 pub use deferred::Deferred;
+pub use packed::PackedWeights;
 
 use candle_core::{
     CpuStorage, DType, Layout, Result, Shape, Storage, StorageRef, Tensor, WithDType, bail,

@@ -13,7 +13,7 @@ use gump_model::relative::grid::FIELDS;
 use gump_model::relative::sample::{Sample, SampleConfig, draw};
 use gump_model::relative::{RelativeConfig, RelativeNetwork};
 use gump_nn::NnError;
-use gump_nn::ops::Deferred;
+use gump_nn::ops::{Deferred, PackedWeights};
 use gump_nn::optimizer::{AdamW, OptimizerConfig};
 use gump_nn::parameters::Parameters;
 use gump_scene::{Scenario, Seed};
@@ -525,6 +525,7 @@ impl State {
         let anchor = self.tether.as_ref().map(|tether| tether.anchor(n_moves));
         let imitated = imitated.par_iter().map(|sample| (sample, true));
         let preferred = judged.par_iter().map(|sample| (*sample, false));
+        let packed = PackedWeights::default();
         let parts = imitated.chain(preferred).map(|(sample, imitates)| {
             let deferred = Deferred::default();
             let build = || match imitates {
@@ -537,7 +538,8 @@ impl State {
                     Ok((found.loss, found.sums, found.entropy, found.divergence))
                 }
             };
-            let built: candle_core::Result<_> = operands.during(|| deferred.during(build));
+            let built: candle_core::Result<_> =
+                operands.during(|| packed.during(|| deferred.during(build)));
             let (loss, sums, entropy, divergence) = built?;
             Ok(Part {
                 gradients: loss.backward()?,
