@@ -112,7 +112,7 @@ impl DriverParameters {
             late: 0.0,
             rolling_stop: 0.3,
             pause: 0.0,
-            bump_speed: around(6.0, 1.5, 2.0).max(3.0),
+            bump_speed: around(5.2, 1.3, 2.0).max(2.4),
             before_people: Some(around(1.0, -0.6, 0.6).max(0.2)),
             behind_others: Some(around(0.7, -0.3, 0.4).max(0.2)),
             clearance: around(1.2, -0.2, 0.4),
@@ -126,8 +126,9 @@ impl DriverParameters {
             true => (rng.random_range(0.6..2.4), rng.random_range(0.0..0.3)),
             false => (0.3, rng.random_range(0.1..1.3)),
         };
-        // Recorded drivers pass bumps at 0.98 of their speed before (median), a quarter at less than 0.83.
-        let slows = rng.random_bool(0.3);
+        // Recorded drivers pass bumps at 0.89 of their speed two seconds before (median), a tenth at less than
+        // 0.6.
+        let slows = rng.random_bool(0.5);
         Self {
             bump_speed: if slows {
                 driver.bump_speed
