@@ -9,7 +9,7 @@
 use std::ops::Range;
 
 use candle_core::{Device, Result, Tensor};
-use gump_nn::layers::{Linear, TABLE_DEVIATION};
+use gump_nn::layers::{Linear, TABLE_DEVIATION, gru};
 use gump_nn::ops;
 use gump_nn::parameters::{Init, Scope};
 use gump_tokenizer::Field;
@@ -155,11 +155,9 @@ struct GruLayer {
 }
 
 impl GruLayer {
-    /// The states after each step, [S, K, C], from the input's gates [S, K, 3C] and the state
-    /// before.
-    fn states(&self, gates: &Tensor, before: &Tensor) -> Result<Tensor> {
-        let bias = self.hidden.bias().expect("it was built with one");
-        ops::gru(gates, before, self.hidden.weight(), bias)
+    /// The states after each step, [S, K, C], from its inputs alike and the state before.
+    fn states(&self, inputs: &Tensor, before: &Tensor) -> Result<Tensor> {
+        gru(inputs, before, [&self.input, &self.hidden])
     }
 }
 
@@ -246,9 +244,7 @@ impl StateDecoder {
         let embedded = embedded.reshape((n - 1, k, c))?.pad_with_zeros(0, 1, 0)?; // [STEPS, K, C]
         let mut inputs = embedded.broadcast_add(&self.slots.reshape((n, 1, c))?)?;
         for layer in &self.layers {
-            // The input side of all steps is one matrix product; only the hidden side is a chain.
-            let gates = layer.input.forward(&inputs)?; // [STEPS, K, 3C]
-            inputs = layer.states(&gates, hidden)?;
+            inputs = layer.states(&inputs, hidden)?;
         }
         Ok(inputs)
     }
@@ -274,8 +270,7 @@ impl StateDecoder {
             None => slot.broadcast_as((k, c))?.contiguous()?,
         };
         for (layer, state) in self.layers.iter().zip(states) {
-            let gates = layer.input.forward(&input)?.unsqueeze(0)?;
-            *state = layer.states(&gates, state)?.squeeze(0)?;
+            *state = layer.states(&input.unsqueeze(0)?, state)?.squeeze(0)?;
             input = state.clone();
         }
         Ok(input)

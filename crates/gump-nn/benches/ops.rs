@@ -263,10 +263,14 @@ fn decode(c: &mut Criterion) {
             || linear(&x, &w, &bias),
         );
     }
-    let (x, h) = (var(&[16, 150, 576], 1.0), var(&[150, 192], 1.0));
+    let (x, h) = (var(&[16, 150, 192], 1.0), var(&[150, 192], 1.0));
     let (w, bias) = (var(&[576, 192], 0.1), var(&[576], 0.1));
+    let map = ops::Affine {
+        weight: &w,
+        bias: Some(&bias),
+    };
     c.bench_function("gru_16x150x192", |b| {
-        b.iter(|| learn(&ops::gru(&x, &h, &w, &bias).expect("shapes fit")).expect("it learns"));
+        b.iter(|| learn(&ops::gru(&x, &h, map, map).expect("shapes fit")).expect("it learns"));
     });
 }
 

@@ -189,6 +189,20 @@ pub fn attention_half(
     )
 }
 
+/// The states after each step of a gated recurrent unit, given its maps of inputs and of states; as one
+/// operation where the products are f32.
+///
+/// Shape: `inputs` `[S, N, C]`, `h` `[N, C]`; the result `[S, N, C]`.
+///
+/// # Errors
+/// Layers of other widths or without a bias.
+pub fn gru(inputs: &Tensor, h: &Tensor, [input, hidden]: [&Linear; 2]) -> Result<Tensor> {
+    if input.product != DType::F32 {
+        return ops::gru_of_gates(&input.forward(inputs)?, h, hidden.affine());
+    }
+    ops::gru(inputs, h, input.affine(), hidden.affine())
+}
+
 /// Seeded dropout: absent at inference.
 #[derive(Clone, Debug)]
 pub struct Dropout {

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use candle_core::{Device, Result, Tensor};
 use gump_kernels::edge_attention::Edges;
 use gump_kernels::smoothing::OrdinalSmoothing;
-use gump_nn::layers::{LayerNorm, Linear, TABLE_DEVIATION};
+use gump_nn::layers::{LayerNorm, Linear, TABLE_DEVIATION, gru};
 use gump_nn::ops;
 use gump_nn::ops::Targets;
 use gump_nn::parameters::{Init, Parameters, Scope};
@@ -138,9 +138,7 @@ impl MoveDecoder {
             .reshape((FIELDS - 1, k, c))?
             .pad_with_zeros(0, 1, 0)?;
         let inputs = embedded.broadcast_add(&self.slots.reshape((FIELDS, 1, c))?)?;
-        let gates = self.input.forward(&inputs)?; // [FIELDS, K, 3C]
-        let bias = self.hidden.bias().expect("it was built with one");
-        ops::gru(&gates, hidden, self.hidden.weight(), bias)
+        gru(&inputs, hidden, [&self.input, &self.hidden])
     }
 }
 

@@ -21,8 +21,13 @@ pub(super) trait Operation: Send + Sync {
     fn forward(&self, x: &[f32]) -> Result<Vec<f32>>;
 
     /// Gradients of `x` and of the other tensors, in the order in which [`apply`] got them; `None`
-    /// for one that has no gradient or has it noted elsewhere.
-    fn backward(&self, x: &Tensor, dy: &Tensor) -> Result<(Tensor, Vec<Option<Tensor>>)>;
+    /// for one that has no gradient or has it noted elsewhere. `y` is the result.
+    fn backward(
+        &self,
+        x: &Tensor,
+        y: &Tensor,
+        dy: &Tensor,
+    ) -> Result<(Tensor, Vec<Option<Tensor>>)>;
 }
 
 /// The result of `operation` on `x`; `others` are contiguous.
@@ -152,10 +157,10 @@ impl<O: Operation> CustomOp2 for Leaving<O> {
         &self,
         x: &Tensor,
         carried: &Tensor,
-        _y: &Tensor,
+        y: &Tensor,
         dy: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>)> {
-        let (dx, others) = self.operation.backward(x, &dy.contiguous()?)?;
+        let (dx, others) = self.operation.backward(x, y, &dy.contiguous()?)?;
         self.left.set(others);
         Ok((Some(dx), Some(carried.zeros_like()?)))
     }

@@ -15,7 +15,7 @@ use gump_kernels::wide;
 use super::attention::{Attention, Inputs, View, causal_self_attention, cross_attention};
 use super::carried::{Operation, apply};
 use super::gelu::{activated, gelu, slope};
-use super::linear::{Linear, bias_gradient, linear, parameter};
+use super::linear::{Linear, bias_gradient, linear};
 use super::norm::{gradients, layer_norm, normalized};
 use super::{Host, fusible, gradient};
 
@@ -312,8 +312,7 @@ impl OwnAffine {
         let weight = Host::new(&self.weight)?;
         let bias = self.bias.as_ref().map(Host::new).transpose()?;
         let bias = bias.as_ref().map(|bias| bias.slice()).transpose()?;
-        let named = (weight.slice()?, parameter(&self.weight));
-        Ok(linear.multiply(x, named, self.weight.dims2()?, bias))
+        linear.multiply(x, (weight.slice()?, &self.weight), bias)
     }
 
     /// The gradient of `x`; those of matrix and bias are put last in `others`.
@@ -472,7 +471,12 @@ impl Operation for FeedForward {
         Ok(y)
     }
 
-    fn backward(&self, x: &Tensor, dy: &Tensor) -> Result<(Tensor, Vec<Option<Tensor>>)> {
+    fn backward(
+        &self,
+        x: &Tensor,
+        _: &Tensor,
+        dy: &Tensor,
+    ) -> Result<(Tensor, Vec<Option<Tensor>>)> {
         let kept = self.kept.get().expect("forward ran before backward");
         let (dz, d_gate) = self.join.backward(&kept.branch, dy)?;
         let (mut of_first, mut of_second) = (Vec::new(), Vec::new());
@@ -541,7 +545,12 @@ impl Operation for AttentionHalf {
         Ok(y)
     }
 
-    fn backward(&self, x: &Tensor, dy: &Tensor) -> Result<(Tensor, Vec<Option<Tensor>>)> {
+    fn backward(
+        &self,
+        x: &Tensor,
+        _: &Tensor,
+        dy: &Tensor,
+    ) -> Result<(Tensor, Vec<Option<Tensor>>)> {
         let kept = self.kept.get().expect("forward ran before backward");
         let (dz, d_gate) = self.join.backward(&kept.branch, dy)?;
         let (mut of_first, mut of_second) = (Vec::new(), Vec::new());

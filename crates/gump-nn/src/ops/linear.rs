@@ -8,10 +8,10 @@ use candle_core::{
 };
 
 use super::deferred::{Deferred, Part};
-use super::packed::{PackedWeights, Side};
+use super::packed::{PackedWeights, Place, Side};
 use super::{Host, elements, fusible, gradient, output};
 use gump_kernels::Operands;
-use gump_kernels::gemm::{Mat, Threads, fresh_product};
+use gump_kernels::gemm::{Mat, MatMut, Right, Store, Threads, fresh_product, gemm};
 use gump_kernels::rows::column_sums;
 
 /// `x weight^T + bias`.
@@ -102,7 +102,7 @@ impl Linear {
 }
 
 /// What a matrix is known by, if it is a parameter: other tensors do not outlive a sample.
-pub(super) fn parameter(weight: &Tensor) -> Option<TensorId> {
+fn parameter(weight: &Tensor) -> Option<TensorId> {
     weight.is_variable().then(|| weight.id())
 }
 
@@ -195,13 +195,22 @@ impl Linear {
         let sizes = weight_layout.shape().dims2()?;
         let mut shape = x_layout.dims().to_vec();
         *shape.last_mut().expect("x has a last axis") = sizes.0;
-        let y = self.multiply(x, (weight, self.weight), sizes, bias);
+        let y = self.multiply_by(x, (weight, self.weight), sizes, bias);
         Ok(output(y, shape))
     }
 
-    /// `x weight^T + bias`, of a matrix `[out, in]` with these sizes, and with this name if it is a
-    /// parameter.
+    /// `x weight^T + bias`, given the numbers of a matrix `[out, in]` and itself.
     pub(super) fn multiply(
+        &self,
+        x: &[f32],
+        (numbers, weight): (&[f32], &Tensor),
+        bias: Option<&[f32]>,
+    ) -> Result<Vec<f32>> {
+        let (sizes, name) = (weight.dims2()?, parameter(weight));
+        Ok(self.multiply_by(x, (numbers, name), sizes, bias))
+    }
+
+    fn multiply_by(
         &self,
         x: &[f32],
         (weight, name): (&[f32], Option<TensorId>),
@@ -211,6 +220,15 @@ impl Linear {
         let x = Mat::new(x, x.len() / n_in.max(1), n_in);
         let turned = Mat::new(weight, n_out, n_in).t();
         self.product(x, (turned, name), Side::Turned, bias)
+    }
+
+    /// A matrix, or its transpose, as the right side of several products.
+    pub(super) fn right<'a>(&self, rhs: Mat<'a>, weight: &Tensor, side: Side) -> Shared<'a> {
+        let packed = self.packed.as_ref().zip(parameter(weight));
+        match packed.filter(|_| self.operands == Operands::Bf16) {
+            Some((packed, name)) => Shared::Packed(packed.of(name, side), rhs),
+            None => Shared::Own(Right::new(rhs, self.operands)),
+        }
     }
 
     /// `lhs rhs` in new memory, plus `bias` in every row; a parameter is packed once a step.
@@ -237,33 +255,69 @@ impl Linear {
     ) -> Result<(Option<Vec<f32>>, Option<Tensor>)> {
         let (n_out, n_in) = weight.dims2()?;
         let dy_tensor = dy;
-        let (x_host, weight_host, dy) = (Host::new(x)?, Host::new(weight)?, Host::new(dy)?);
-        let (x_all, w) = (x_host.slice::<f32>()?, weight_host.slice::<f32>()?);
+        let (weight_host, dy) = (Host::new(weight)?, Host::new(dy)?);
+        let w = weight_host.slice::<f32>()?;
         let dy = dy.slice::<f32>()?;
-        let rows = x_all.len() / n_in.max(1);
-        let dy = Mat::new(dy, rows, n_out);
+        let dy = Mat::new(dy, dy.len() / n_out.max(1), n_out);
         let dx = if wants_dx {
             let w = (Mat::new(w, n_out, n_in), parameter(weight));
             Some(self.product(dy, w, Side::Straight, None))
         } else {
             None
         };
-        let dw = if let Some(deferred) = self.deferred.as_ref().filter(|_| weight.is_variable()) {
-            let part = Part::Product {
-                x: x.detach(),
-                dy: dy_tensor.detach(),
-                operands: self.operands,
-            };
-            deferred.note(weight, part);
-            None
-        } else if weight.track_op() {
-            let x_all = (Mat::new(x_all, rows, n_in), None);
-            let dw = fresh_product(dy.t(), x_all, None, Threads::Pool, self.operands);
-            Some(gradient(dw, weight)?)
-        } else {
-            None
-        };
+        let dw = self.weight_gradient(weight, &[(x.detach(), dy_tensor.detach())])?;
         Ok((dx, dw))
+    }
+
+    /// The gradient of a matrix `[out, in]`, if it is due now: the sum of `dy^T x` over parts of `x`
+    /// `[.., in]` with `dy` `[.., out]`.
+    pub(super) fn weight_gradient(
+        &self,
+        weight: &Tensor,
+        parts: &[(Tensor, Tensor)],
+    ) -> Result<Option<Tensor>> {
+        let operands = self.operands;
+        if let Some(deferred) = self.deferred.as_ref().filter(|_| weight.is_variable()) {
+            for (x, dy) in parts.iter().cloned() {
+                deferred.note(weight, Part::Product { x, dy, operands });
+            }
+            return Ok(None);
+        }
+        if !weight.track_op() {
+            return Ok(None);
+        }
+        let (n_out, n_in) = weight.dims2()?;
+        let mut dw = vec![0.0; n_out * n_in];
+        for (i, (x, dy)) in parts.iter().enumerate() {
+            let (x, dy) = (Host::new(x)?, Host::new(dy)?);
+            let (x, dy) = (x.slice::<f32>()?, dy.slice::<f32>()?);
+            let rows = x.len() / n_in.max(1);
+            gemm(
+                MatMut::new(&mut dw, n_out, n_in),
+                if i == 0 { Store::Replace } else { Store::Add },
+                1.0,
+                Mat::new(dy, rows, n_out).t(),
+                Mat::new(x, rows, n_in),
+                Threads::Pool,
+                operands,
+            );
+        }
+        Ok(Some(gradient(dw, weight)?))
+    }
+}
+
+/// A right matrix for several products, packed for the step or for these.
+pub(super) enum Shared<'a> {
+    Packed(Place, Mat<'a>),
+    Own(Right<'a>),
+}
+
+impl<'a> Shared<'a> {
+    pub(super) fn get(&self) -> &Right<'a> {
+        match self {
+            Self::Packed(place, rhs) => place.get_or_init(|| Right::packed(*rhs)),
+            Self::Own(right) => right,
+        }
     }
 }
 

@@ -38,7 +38,7 @@ pub use conv::conv2d;
 pub use divergence::{weighted_divergence, weighted_entropy};
 pub use edge_attention::edge_attention;
 pub use gelu::gelu;
-pub use gru::gru;
+pub use gru::{gru, gru_of_gates};
 pub use half_block::{Affine, Join, Scaling, Seen, attention_half, feed_forward};
 pub use linear::{linear, reduced_linear};
 pub use loss::{Targets, linear_cross_entropy, masked_cross_entropy};

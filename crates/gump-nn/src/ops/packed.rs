@@ -24,7 +24,7 @@ pub(super) enum Side {
 }
 
 /// A packed matrix, or the place for it.
-type Place = Arc<OnceLock<Right<'static>>>;
+pub(super) type Place = Arc<OnceLock<Right<'static>>>;
 
 /// The packed parameters of one training step; operations built within [`Self::during`] share them.
 ///
