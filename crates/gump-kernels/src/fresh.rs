@@ -16,7 +16,7 @@ use crate::gemm::Threads;
 /// `len` numbers in new memory, written by `f(piece_index, piece)`. A piece begins as rows of `row`
 /// where there is one, which must divide it, else as zeros.
 ///
-/// Panics when `piece` is 0.
+/// Panics when `piece` is 0 or no whole number of rows.
 pub fn fresh_pieces(
     len: usize,
     piece: usize,
@@ -25,6 +25,8 @@ pub fn fresh_pieces(
     f: impl Fn(usize, &mut [f32]) + Sync,
 ) -> Vec<f32> {
     assert!(piece > 0, "pieces of at least one number");
+    let whole = row.is_none_or(|row| row.is_empty() || piece.is_multiple_of(row.len()));
+    assert!(whole, "pieces of whole rows");
     let mut numbers = Vec::with_capacity(len);
     let room = &mut numbers.spare_capacity_mut()[..len];
     let work = |(i, room): (usize, &mut [MaybeUninit<f32>])| f(i, begun(room, row));
@@ -76,6 +78,12 @@ mod tests {
             assert_eq!(rows, [1., 2., 1., 2., 2., 2., 1., 2.]);
         }
         assert!(fresh_pieces(0, 4, Some(&[]), Threads::Pool, |_, _| {}).is_empty());
+    }
+
+    #[test]
+    #[should_panic(expected = "pieces of whole rows")]
+    fn a_piece_is_a_whole_number_of_rows() {
+        fresh_pieces(6, 3, Some(&[1.0, 2.0]), Threads::One, |_, _| {});
     }
 
     #[test]

@@ -276,7 +276,9 @@ pub(crate) fn f32_fresh_product(
     product
 }
 
-/// [`gemm()`] of the numbers as they are; the shapes fit.
+/// [`gemm()`] of the numbers as they are.
+///
+/// Panics when the shapes do not fit.
 pub fn f32_product(
     dst: MatMut<'_>,
     store: Store,
@@ -285,11 +287,14 @@ pub fn f32_product(
     rhs: Mat<'_>,
     threads: Threads,
 ) {
+    assert_eq!(dst.rows, lhs.rows, "rows of the product");
+    assert_eq!(dst.cols, rhs.cols, "columns of the product");
     let MatMut {
         data, row_stride, ..
     } = dst;
-    // SAFETY: the constructor checked that every (row, column) lies in the slice of `dst` and that
-    // its rows are disjoint; it is a unique borrow, so it overlaps neither operand.
+    // SAFETY: the constructor checked that every (row, column) lies in the slice of `dst`, which is
+    // as large as the product, and that its rows are disjoint; it is a unique borrow, so it overlaps
+    // neither operand.
     unsafe {
         let to = (data.as_mut_ptr(), row_stride);
         multiply(to, store, scale, lhs, rhs, threads);
@@ -309,6 +314,7 @@ unsafe fn multiply(
     rhs: Mat<'_>,
     threads: Threads,
 ) {
+    assert_eq!(lhs.cols, rhs.rows, "inner size of the product");
     let stride = |s: usize| isize::try_from(s).expect("a stride is within a slice");
     // SAFETY: as the function's; the constructors of both operands checked that every (row, column)
     // lies in its slice.
@@ -372,6 +378,14 @@ mod tests {
         let dst = MatMut::new(&mut c, 2, 3);
         f32_product(dst, Store::Add, -1.0, lhs, rhs, Threads::One);
         assert_eq!(c, [0.0; 6]);
+    }
+
+    #[test]
+    #[should_panic(expected = "rows of the product")]
+    fn a_product_larger_than_its_destination_is_refused() {
+        let (mut to, a) = ([0.0; 2], [0.0; 4]);
+        let (dst, a) = (MatMut::new(&mut to, 1, 2), Mat::new(&a, 2, 2));
+        f32_product(dst, Store::Replace, 1.0, a, a, Threads::One);
     }
 
     #[test]

@@ -15,7 +15,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use candle_core::{Result, Tensor, TensorId};
 
-use super::Host;
+use super::{Host, scope};
 use gump_kernels::Operands;
 use gump_kernels::gemm::{Mat, MatMut, Store, Threads, gemm};
 use gump_kernels::rows::add_to;
@@ -53,15 +53,7 @@ impl Deferred {
 
     /// Runs `f`, whose operations note gradients here.
     pub fn during<R>(&self, f: impl FnOnce() -> R) -> R {
-        /// Restores the previous collector when dropped, even if `f` panics.
-        struct Before(Option<Deferred>);
-        impl Drop for Before {
-            fn drop(&mut self) {
-                CURRENT.replace(self.0.take());
-            }
-        }
-        let _before = Before(CURRENT.replace(Some(self.clone())));
-        f()
+        scope::within(&CURRENT, self.clone(), f)
     }
 
     /// Notes a part of the gradient of `matrix`.

@@ -27,6 +27,7 @@ mod loss;
 mod norm;
 mod packed;
 mod pool;
+mod scope;
 mod table;
 
 pub use absolute::mean_absolute_difference;

@@ -14,6 +14,8 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use candle_core::TensorId;
 use gump_kernels::gemm::Right;
 
+use super::scope;
+
 /// How a matrix `[out, in]` is multiplied.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub(super) enum Side {
@@ -44,15 +46,7 @@ impl PackedWeights {
 
     /// Runs `f`, whose operations take parameters from here, also in their gradients.
     pub fn during<R>(&self, f: impl FnOnce() -> R) -> R {
-        /// Restores the previous ones when dropped, even if `f` panics.
-        struct Before(Option<PackedWeights>);
-        impl Drop for Before {
-            fn drop(&mut self) {
-                CURRENT.replace(self.0.take());
-            }
-        }
-        let _before = Before(CURRENT.replace(Some(self.clone())));
-        f()
+        scope::within(&CURRENT, self.clone(), f)
     }
 
     /// The place of a parameter.
