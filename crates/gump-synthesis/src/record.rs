@@ -111,7 +111,8 @@ impl Recording {
         self.lights.iter_mut().for_each(Vec::clear);
     }
 
-    /// Removes pedestrians and parked vehicles whose boxes overlap others; false if two boxes of
+    /// Removes pedestrians and parked vehicles whose boxes overlap those of others, people of one group
+    /// excepted; false if two boxes of
     /// traffic overlap.
     pub(crate) fn part_bodies(&mut self) -> bool {
         let mut out = BTreeSet::new();
@@ -128,7 +129,8 @@ impl Recording {
                 for (b, other, their_reach) in &boxes[i + 1..] {
                     let stand = !a.is_mobile && !b.is_mobile && frame > 0;
                     let apart = shape.pose.position.distance(other.pose.position);
-                    if stand || apart > reach + their_reach || !shape.overlaps(other) {
+                    let together = a.group == b.group;
+                    if stand || together || apart > reach + their_reach || !shape.overlaps(other) {
                         continue;
                     }
                     if out.contains(&a.id) || out.contains(&b.id) {

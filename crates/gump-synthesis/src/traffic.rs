@@ -17,6 +17,7 @@ mod vehicle;
 
 pub(crate) use crosser::{Jaywalk, Span};
 pub(crate) use demand::{Demand, Scenery, Standing};
+pub(crate) use people::draw_beside;
 pub(crate) use size::{draw_person_size, draw_real_size};
 
 use gump_geometry::{DVec2, Pose};
@@ -41,6 +42,8 @@ pub(crate) struct Body {
     pub(crate) pose: Pose,
     /// Moves in this simulation; parked vehicles do not.
     pub(crate) is_mobile: bool,
+    /// Its own id, or that of the pedestrian it walks with: a group walks so close that boxes overlap.
+    pub(crate) group: i64,
     /// Lane of the centre and arc length on it, for vehicles in traffic.
     pub(crate) place: Option<(LaneIdx, f64)>,
 }

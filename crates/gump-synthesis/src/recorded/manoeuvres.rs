@@ -152,15 +152,15 @@ pub(super) fn is_off_road(network: &Network, pose: Pose, far: f64) -> bool {
 }
 
 /// True if a body of this length and width on this path, one pose per snapshot, keeps its distance
-/// to all other agents, standing and moving.
+/// to all agents of other groups, standing and moving.
 pub(super) fn is_clear(
     recording: &Recording,
-    id: i64,
+    group: i64,
     [length, width]: [f64; 2],
     rooms: [f64; 2],
     poses: &[Option<Pose>],
 ) -> bool {
-    let mut others = recording.tracks().filter(|track| track.body.id != id);
+    let mut others = recording.tracks().filter(|track| track.body.group != group);
     others.all(|other| {
         let [l, w, _] = other.body.size;
         let room = rooms[usize::from(other.body.is_mobile)];

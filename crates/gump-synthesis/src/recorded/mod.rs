@@ -74,7 +74,7 @@ pub(crate) fn config() -> SynthesisConfig {
     SynthesisConfig {
         extent_m: 150.0,
         vehicles: 8..=44,
-        pedestrians: 0..=34,
+        pedestrians: 0..=46,
         bicycles: 0..=3,
         ..SynthesisConfig::standard()
     }
@@ -122,6 +122,7 @@ pub(crate) fn draw_scenario(
     let mut parking_rng = seed.fork(attempt).fork(2).rng();
     manoeuvres::add(&mut recording, &network, config.dt, &mut parking_rng);
     walkers::add(&mut recording, &network, config.dt, &mut parking_rng);
+    walkers::shift(&mut recording, config.dt, &mut parking_rng);
     let ego = choose_ego(&recording, config.now(), &mut rng)?;
     let placement = draw_placement(&mut rng);
     let mut route = route(&network, ego, &traffic, &placement);
@@ -181,7 +182,7 @@ fn draw_demand(
     let bustle = rng.random_range(0.0_f64..1.0);
     let people = draw_skewed(
         &config.pedestrians,
-        4.5,
+        6.0,
         config.density * (0.4 + bustle),
         rng,
     );

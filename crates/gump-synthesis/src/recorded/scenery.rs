@@ -1,6 +1,9 @@
 //! Standing agents and crossing places: parked vehicles, waiting pedestrians, loading vehicles,
 //! places where pedestrians cross.
 
+use std::f64::consts::PI;
+use std::ops::Range;
+
 use gump_geometry::{DVec2, Pose, wrap_angle};
 use gump_scene::{AgentKind, LaneKind, Rng};
 use rand::Rng as _;
@@ -8,7 +11,7 @@ use rand::Rng as _;
 use super::driveways::{self, Driveway};
 use super::islands::Island;
 use crate::SynthesisConfig;
-use crate::curve::{Track, line};
+use crate::curve::{Track, connect, line};
 use crate::network::{LaneIdx, Network, draw_slant};
 use crate::traffic::{Jaywalk, Scenery, Span, Standing, draw_person_size, draw_real_size};
 
@@ -26,7 +29,16 @@ const JAYWALK_ROOM: f64 = 4.0;
 const WALK_TO_CURB: f64 = 2.2;
 /// From the middle of a sidewalk to people who stand beside it, metres: out of the way of those who
 /// walk. Chosen by eye.
-const BESIDE_WALK: std::ops::Range<f64> = 2.2..3.3;
+const BESIDE_WALK: Range<f64> = 2.2..3.3;
+/// Metres along the sidewalk to a place where people cross, and on from there.
+const APPROACH: Range<f64> = 6.0..28.0;
+/// Metres before that place at which they turn to the curb, and the reach of the turn, metres. Chosen by eye.
+const BEFORE_CORNER: f64 = 2.5;
+const CORNER: f64 = 1.2;
+/// Metres from the end of a road, where sidewalks turn, that are not walked on such a way.
+const ROAD_END: f64 = 8.0;
+/// How fast they walk, m/s. Chosen by hand.
+const PACE: Range<f64> = 0.9..1.9;
 /// Share of scenes in which a vehicle has stopped in its lane. Chosen by hand.
 const HELD: f64 = 0.12;
 /// Parked vehicles of a scene, at most, before density. Fitted by hand.
@@ -40,20 +52,24 @@ pub(crate) fn draw(
     rng: &mut Rng,
 ) -> Scenery {
     let jaywalks = draw_jaywalks(network, rng);
-    let begins = config.warmup_s - 8.0;
-    let ends = config.warmup_s + config.history_s + config.future_s;
     let crossers = (0..jaywalks.len())
         .filter(|_| rng.random_bool(0.35 + 0.6 * bustle))
         .collect::<Vec<_>>();
-    let crossers = crossers
-        .into_iter()
-        .map(|way| (way, rng.random_range(begins..ends)));
+    let times = -8.0..config.history_s + config.future_s;
+    let crossers = crossers.into_iter().map(|way: usize| {
+        let pace = rng.random_range(PACE);
+        let crosses = rng.random_range(times.clone());
+        let sets_off = crosses - jaywalks[way].curbs.0 / pace;
+        // Nobody waits for the time to come: all are on their way when the recording begins.
+        (way, pace, config.warmup_s + sets_off.min(-1.0))
+    });
     let crossers = crossers.collect();
     let mut standing = parked(network, rng);
     standing.retain(|body| {
         let at = body.pose.position;
         let off = |way: &Jaywalk| {
-            let foot = way.track.pose_at(way.track.project(at)).position;
+            let foot = way.track.project(at).clamp(way.curbs.0, way.curbs.1);
+            let foot = way.track.pose_at(foot).position;
             foot.distance(at) > JAYWALK_ROOM
         };
         jaywalks.iter().all(off)
@@ -190,7 +206,7 @@ fn waiting_people(network: &Network, bustle: f64, rng: &mut Rng) -> Vec<Standing
     if walks.is_empty() {
         return people;
     }
-    let n_groups = rng.random_range(0..=(1.0 + 6.0 * bustle) as usize);
+    let n_groups = rng.random_range(0.0..1.0 + 2.2 * bustle) as usize;
     for _ in 0..n_groups {
         let walk = walks[rng.random_range(0..walks.len())];
         let s = rng.random_range(4.0..walk.length() - 4.0);
@@ -213,7 +229,7 @@ fn waiting_people(network: &Network, bustle: f64, rng: &mut Rng) -> Vec<Standing
                 size: draw_person_size(rng),
                 pose: Pose {
                     position,
-                    heading: rng.random_range(-std::f64::consts::PI..std::f64::consts::PI),
+                    heading: rng.random_range(-PI..PI),
                 },
             });
         }
@@ -284,10 +300,12 @@ fn draw_jaywalks(network: &Network, rng: &mut Rng) -> Vec<Jaywalk> {
         let mirrored = rng.random_bool(0.5);
         let apart = |way: &Jaywalk| {
             let here = network.lanes[lane].track.pose_at(s).position;
-            way.track.points().iter().all(|p| p.distance(here) > 8.0)
+            let (from, to) = way.curbs;
+            let across = [0.0, 0.5, 1.0].map(|k| way.track.pose_at(from + k * (to - from)));
+            across.iter().all(|pose| pose.position.distance(here) > 8.0)
         };
         if ways.iter().all(apart)
-            && let Some(way) = way_across(network, lane, s, mirrored)
+            && let Some(way) = way_across(network, (lane, s), mirrored, rng)
         {
             ways.push(way);
         }
@@ -295,9 +313,15 @@ fn draw_jaywalks(network: &Network, rng: &mut Rng) -> Vec<Jaywalk> {
     ways
 }
 
-/// The way across at a place on a lane; `None` without sidewalks on both sides.
-fn way_across(network: &Network, lane: LaneIdx, s: f64, mirrored: bool) -> Option<Jaywalk> {
-    let pose = network.lanes[lane].track.pose_at(s);
+/// The way across at a place on a lane, from one sidewalk to the other; `None` without both.
+fn way_across(
+    network: &Network,
+    (lane, s): (LaneIdx, f64),
+    mirrored: bool,
+    rng: &mut Rng,
+) -> Option<Jaywalk> {
+    let road = &network.lanes[lane].track;
+    let pose = road.pose_at(s);
     // Distances to the left at which something runs along the road here.
     let abeam = |track: &Track| {
         let foot = track.project(pose.position);
@@ -313,15 +337,16 @@ fn way_across(network: &Network, lane: LaneIdx, s: f64, mirrored: bool) -> Optio
         .collect();
     let nearest = |sign: f64| {
         let side = walks.iter().filter(|y| **y * sign > 0.0).map(|y| y * sign);
-        side.reduce(f64::min)
-            .map(|y| (y - WALK_TO_CURB + 0.5) * sign)
+        side.reduce(f64::min).map(|y| y * sign)
     };
     let (left, right) = (nearest(1.0)?, nearest(-1.0)?);
-    let (from, to) = if mirrored {
+    let sidewalks = if mirrored {
         (left, right)
     } else {
         (right, left)
     };
+    let curb = |walk: f64| walk - (WALK_TO_CURB - 0.5) * walk.signum();
+    let (from, to) = (curb(sidewalks.0), curb(sidewalks.1));
     let sign = (to - from).signum();
     let spans = network.lanes.iter().enumerate().filter_map(|(other, l)| {
         let (y, at) = abeam(&l.track)?;
@@ -334,12 +359,48 @@ fn way_across(network: &Network, lane: LaneIdx, s: f64, mirrored: bool) -> Optio
             across: (across - half, across + half),
         })
     });
-    let track = Track::through(&line(
-        pose * DVec2::new(0.0, from),
-        pose * DVec2::new(0.0, to),
-    ));
+    let spans: Vec<Span> = spans.collect();
+    let ahead = (pose.direction().perp() * sign).to_angle();
+    let ends = [(from, ahead), (to, wrap_angle(ahead + PI))].map(|(y, heading)| Pose {
+        position: pose * DVec2::new(0.0, y),
+        heading,
+    });
+    let mut points = approach(road, (s, sidewalks.0), ends[0], rng);
+    points.extend(line(ends[0].position, ends[1].position));
+    points.extend(
+        approach(road, (s, sidewalks.1), ends[1], rng)
+            .into_iter()
+            .rev(),
+    );
+    let track = Track::through(&points);
+    let curbs = ends.map(|end| track.project(end.position));
+    let span = |span: Span| Span {
+        across: (span.across.0 + curbs[0], span.across.1 + curbs[0]),
+        ..span
+    };
     Some(Jaywalk {
+        curbs: (curbs[0], curbs[1]),
+        spans: spans.into_iter().map(span).collect(),
         track,
-        spans: spans.collect(),
     })
+}
+
+/// Points along a sidewalk, `s` metres along the road and `y` to its left, to a curb and the direction
+/// across.
+fn approach(road: &Track, (s, y): (f64, f64), curb: Pose, rng: &mut Rng) -> Vec<DVec2> {
+    let side = if rng.random_bool(0.5) { 1.0 } else { -1.0 };
+    let room = if side > 0.0 { road.length() - s } else { s };
+    let far = rng.random_range(APPROACH).min(room - ROAD_END);
+    if far < BEFORE_CORNER + 1.0 {
+        return Vec::new();
+    }
+    let n = ((far - BEFORE_CORNER) / 0.5).ceil() as usize;
+    let at = |k: usize| {
+        let back = BEFORE_CORNER + (far - BEFORE_CORNER) * (n - k) as f64 / n as f64;
+        let along = road.pose_at(s + side * back);
+        along * Pose::new(0.0, y, if side > 0.0 { PI } else { 0.0 })
+    };
+    let mut points: Vec<DVec2> = (0..=n).map(|k| at(k).position).collect();
+    points.extend(connect(at(n), curb, [0.0; 2], CORNER));
+    points
 }

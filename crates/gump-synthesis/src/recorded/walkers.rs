@@ -4,6 +4,8 @@
 //! Like parking manoeuvres they are added to the recording of traffic, and only if they stay clear
 //! of all other agents.
 
+use std::f64::consts::PI;
+
 use gump_geometry::{DVec2, OrientedBox, Pose, angle_difference, wrap_angle};
 use gump_scene::{AgentKind, Rng};
 use rand::Rng as _;
@@ -11,21 +13,21 @@ use rand::Rng as _;
 use super::manoeuvres::{is_clear, is_off_road};
 use crate::network::Network;
 use crate::record::Recording;
-use crate::traffic::{Body, draw_person_size};
+use crate::traffic::{Body, draw_beside, draw_person_size};
 
 // The number of people was fitted by hand to the targets (see the module above). Distances, speeds
 // and the coefficients of `way` were chosen by eye, so that people walk past vehicles and do not
 // get stuck between them; they were not varied one by one.
 /// Maximum number of such pedestrians, or pairs of them, in a scene.
-const MOST: f64 = 16.0;
+const MOST: f64 = 20.0;
 /// Number of paths tried for each.
 const TRIED: usize = 8;
 /// Scenes with fewer parked vehicles near the centre have none.
 const LEAST_PARKED: usize = 6;
 /// Only vehicles this near to the centre of the scene are walked to, metres: the ego sees 79 m far.
 const REACH_M: f64 = 70.0;
-/// Length of a walk, metres.
-const WAY_M: std::ops::Range<f64> = 6.0..45.0;
+/// Length of a walk between vehicles, and to elsewhere, metres.
+const WAY_M: [std::ops::Range<f64>; 2] = [6.0..70.0, 15.0..80.0];
 /// Distances from the centre of a lane of a road, metres: beyond the first people are off the road;
 /// from the second they may stand, as at the door of a vehicle beside the lane.
 const OFF_ROAD_M: f64 = 2.4;
@@ -39,6 +41,64 @@ const ASIDE_M: f64 = 1.0;
 const TURN_RATE: f64 = 1.8;
 /// Change of walking speed, m/s².
 const CHANGE: f64 = 1.2;
+
+/// Share of those that walk away from a vehicle that appear when they begin to, and of those that walk
+/// to one that vanish when they are there.
+const GETS_OUT: f64 = 0.85;
+const GETS_IN: f64 = 0.75;
+/// Share of standing people that take a few steps, how far, metres, and how fast, m/s. Of those that stand
+/// in recordings at all a fifth do so within nine seconds, and stand again.
+const STEPS: f64 = 0.6;
+const STEPS_M: std::ops::Range<f64> = 0.5..2.5;
+const STEPS_MPS: std::ops::Range<f64> = 0.4..0.9;
+
+/// Lets some of the people that stand take a few steps, if there is room.
+pub(crate) fn shift(recording: &mut Recording, dt: f64, rng: &mut Rng) {
+    let stands = |body: &Body| body.kind == AgentKind::Pedestrian && !body.is_mobile;
+    let bodies = recording.tracks().map(|track| track.body);
+    let standing: Vec<Body> = bodies.filter(stands).collect();
+    for body in standing {
+        if !rng.random_bool(STEPS) {
+            continue;
+        }
+        let poses = steps(body.pose, recording.n_snapshots(), dt, rng);
+        let size = [body.size[0], body.size[1]];
+        if is_clear(recording, body.group, size, [0.05, 0.5], &poses) {
+            recording.move_along(body.id, poses);
+        }
+    }
+}
+
+/// Poses of a person that stands, takes a few steps and stands again, one per snapshot.
+fn steps(from: Pose, n: usize, dt: f64, rng: &mut Rng) -> Vec<Option<Pose>> {
+    let to = DVec2::from_angle(rng.random_range(-PI..PI)) * rng.random_range(STEPS_M);
+    let pace = rng.random_range(STEPS_MPS);
+    let starts = rng.random_range(-2.0..n as f64 * dt);
+    let (mut pose, mut speed) = (from, 0.0_f64);
+    let before = ((-starts).max(0.0) / dt) as usize;
+    let mut poses = Vec::with_capacity(n);
+    for step in 0..n + before {
+        if step >= before {
+            poses.push(Some(pose));
+        }
+        if (step as f64 - before as f64) * dt < starts {
+            continue;
+        }
+        let left = from.position + to - pose.position;
+        let turn = angle_difference(left.to_angle(), pose.heading);
+        // Who faces away turns before the first step.
+        let wanted = pace
+            .min((2.0 * CHANGE * left.length()).sqrt())
+            .min(pace * turn.cos().max(0.0));
+        speed += (wanted - speed).clamp(-2.0 * CHANGE * dt, CHANGE * dt);
+        if left.length() > 0.1 {
+            let most = TURN_RATE * dt;
+            pose.heading = wrap_angle(pose.heading + (4.0 * dt * turn).clamp(-most, most));
+            pose.position += pose.direction() * (speed * dt).min(left.length());
+        }
+    }
+    poses
+}
 
 /// Adds pedestrians that walk between the parked vehicles of a scene.
 pub(crate) fn add(recording: &mut Recording, network: &Network, dt: f64, rng: &mut Rng) {
@@ -73,20 +133,16 @@ pub(crate) fn add(recording: &mut Recording, network: &Network, dt: f64, rng: &m
             if !is_clear(recording, id, [size[0], size[1]], room, &poses) {
                 continue;
             }
-            recording.add(person(id, size, shown[0]), poses.clone());
+            recording.add(person((id, id), size, shown[0]), poses.clone());
             if rng.random_bool(0.35) {
                 // A companion beside, if there is room.
-                let beside = Pose::new(
-                    rng.random_range(-0.3..0.3),
-                    rng.random_range(0.85..1.15),
-                    0.0,
-                );
+                let beside = Pose::new(rng.random_range(-0.3..0.3), draw_beside(rng), 0.0);
                 let poses: Vec<Option<Pose>> =
                     poses.iter().map(|pose| pose.map(|p| p * beside)).collect();
-                let (id, size) = (recording.new_id(), draw_person_size(rng));
-                if is_clear(recording, id, [size[0], size[1]], [room[0]; 2], &poses) {
+                let (other, size) = (recording.new_id(), draw_person_size(rng));
+                if is_clear(recording, id, [size[0], size[1]], room, &poses) {
                     let first = *poses.iter().flatten().next().expect("somebody is shown");
-                    recording.add(person(id, size, first), poses);
+                    recording.add(person((other, id), size, first), poses);
                 }
             }
             break;
@@ -94,9 +150,10 @@ pub(crate) fn add(recording: &mut Recording, network: &Network, dt: f64, rng: &m
     }
 }
 
-fn person(id: i64, size: [f64; 3], pose: Pose) -> Body {
+fn person((id, group): (i64, i64), size: [f64; 3], pose: Pose) -> Body {
     Body {
         id,
+        group,
         kind: AgentKind::Pedestrian,
         size,
         pose,
@@ -115,21 +172,20 @@ fn way(parked: &[OrientedBox], n: usize, dt: f64, rng: &mut Rng) -> Option<Vec<O
         let along = rng.random_range(-0.3..0.3) * vehicle.length;
         vehicle.pose * DVec2::new(along, aside)
     };
-    let away = DVec2::from_angle(rng.random_range(-std::f64::consts::PI..std::f64::consts::PI))
-        * rng.random_range(WAY_M);
+    let away = DVec2::from_angle(rng.random_range(-PI..PI)) * rng.random_range(WAY_M[1].clone());
     let from = door(rng);
     let to = if rng.random_bool(0.3) {
         door(rng)
     } else {
         from + away
     };
-    if !(WAY_M.start..2.0 * WAY_M.end).contains(&from.distance(to)) {
+    if !WAY_M[0].contains(&from.distance(to)) && !WAY_M[1].contains(&from.distance(to)) {
         return None;
     }
-    // To the vehicle as often as from it.
-    let (from, to, ends_inside) = match rng.random_bool(0.5) {
-        true => (from, to, false),
-        false => (to, from, rng.random_bool(0.5)),
+    // To the vehicle as often as from it. Most people get out when they begin to walk.
+    let (from, to, begins_inside, ends_inside) = match rng.random_bool(0.5) {
+        true => (from, to, rng.random_bool(GETS_OUT), false),
+        false => (to, from, false, rng.random_bool(GETS_IN)),
     };
     let near: Vec<&OrientedBox> = parked
         .iter()
@@ -150,10 +206,12 @@ fn way(parked: &[OrientedBox], n: usize, dt: f64, rng: &mut Rng) -> Option<Vec<O
     let mut poses = Vec::with_capacity(n);
     let (mut stuck, mut is_there) = (0.0, false);
     for step in 0..n + before {
+        let is_inside = (step as f64 - before as f64) * dt < starts;
         if step >= before {
-            poses.push((!is_there || !ends_inside).then_some(pose));
+            let hidden = is_inside && begins_inside || is_there && ends_inside;
+            poses.push((!hidden).then_some(pose));
         }
-        if (step as f64 - before as f64) * dt < starts || is_there {
+        if is_inside || is_there {
             continue;
         }
         let left = to - pose.position;

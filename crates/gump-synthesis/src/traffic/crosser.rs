@@ -1,5 +1,5 @@
-//! Pedestrians that cross the road where there is no crosswalk: they wait for a gap and walk
-//! straight across.
+//! Pedestrians that cross the road where there is no crosswalk: they come along the sidewalk, wait for a
+//! gap if there is none, walk straight across, and go on along the sidewalk.
 //!
 //! Vehicles do not have to yield, so pedestrians start only when all approaching vehicles are far
 //! enough away; once they are on the road, vehicles stop for them as for any obstacle.
@@ -19,16 +19,19 @@ const SPARE_S: f64 = 2.0;
 const AT_LEAST: f64 = 3.0;
 /// Metres before and behind a lane in which a person is in the way.
 const IN_THE_WAY: f64 = 0.9;
+/// Seconds before the curb at which people look for a gap, so that they need not stop if there is one.
+const LOOKS_S: f64 = 1.2;
 /// Change of walking speed, m/s²: that of all people here.
 const CHANGE: f64 = 1.2;
 /// Lanes of its path on which a vehicle is looked for ahead of where it is.
 const LOOK_AHEAD: usize = 5;
 
-/// A way across a road from curb to curb.
+/// A way along the sidewalk, across the road from curb to curb, and on along the sidewalk.
 #[derive(Clone, Debug)]
 pub(crate) struct Jaywalk {
-    /// From where people wait to where they arrive.
     pub(crate) track: Track,
+    /// Arc lengths of the two curbs, metres: people wait for a gap at the first.
+    pub(crate) curbs: (f64, f64),
     /// The lanes on the way.
     pub(crate) spans: Vec<Span>,
 }
@@ -39,21 +42,23 @@ pub(crate) struct Span {
     pub(crate) lane: LaneIdx,
     /// Arc length on the lane, metres.
     pub(crate) at: f64,
-    /// From where to where on the way across, metres.
+    /// From where to where on the way, arc lengths, metres.
     pub(crate) across: (f64, f64),
 }
 
-/// A pedestrian on the way across, or waiting for a gap.
+/// A pedestrian on such a way.
 #[derive(Clone, Debug)]
 pub(crate) struct Crosser {
     pub(crate) id: i64,
+    /// The one it walks with, or itself.
+    group: i64,
     pub(crate) size: [f64; 3],
     /// Index of the way.
     pub(crate) jaywalk: usize,
     /// Metres per second.
     pub(crate) pace: f64,
-    /// Seconds of the simulation before which the person does not want to cross.
-    pub(crate) starts: f64,
+    /// Seconds of the simulation at which it begins to walk.
+    sets_off: f64,
     /// Metres to the left of the way's middle.
     aside: f64,
     progress: f64,
@@ -63,20 +68,21 @@ pub(crate) struct Crosser {
 }
 
 impl Crosser {
-    /// A pedestrian waiting at the beginning of a crossing path.
+    /// A pedestrian at the beginning of a way.
     pub(crate) fn new(
         id: i64,
         size: [f64; 3],
         (jaywalk, way): (usize, &Jaywalk),
         pace: f64,
-        starts: f64,
+        sets_off: f64,
     ) -> Self {
         Self {
             id,
+            group: id,
             size,
             jaywalk,
             pace,
-            starts,
+            sets_off,
             aside: 0.0,
             progress: 0.0,
             speed: 0.0,
@@ -98,6 +104,7 @@ impl Crosser {
     pub(crate) fn body(&self) -> Body {
         Body {
             id: self.id,
+            group: self.group,
             kind: AgentKind::Pedestrian,
             size: self.size,
             pose: Pose {
@@ -117,12 +124,14 @@ impl TrafficSimulation<'_> {
         for i in 0..self.crossers.len() {
             let mut crosser = self.crossers[i].clone();
             let way = &ways[crosser.jaywalk];
-            if !crosser.goes && self.time >= crosser.starts {
-                crosser.goes = self.has_gap(way, crosser.pace);
+            let to_curb = way.curbs.0 - crosser.progress;
+            if !crosser.goes && to_curb < LOOKS_S * crosser.pace {
+                crosser.goes = self.has_gap(way, &crosser);
             }
             let length = way.track.length();
-            let left = length - crosser.progress;
-            if crosser.goes && left > 0.05 {
+            let end = if crosser.goes { length } else { way.curbs.0 };
+            let left = end - crosser.progress;
+            if self.time >= crosser.sets_off && left > 0.05 {
                 let wanted = crosser.pace.min((2.0 * CHANGE * left).sqrt());
                 crosser.speed = (crosser.speed + CHANGE * self.dt).min(wanted);
                 crosser.progress = (crosser.progress + crosser.speed * self.dt).min(length);
@@ -140,10 +149,11 @@ impl TrafficSimulation<'_> {
         self.demand.scenery.jaywalks = ways;
     }
 
-    /// True if no vehicle on any lane of the way arrives before a person of this pace has passed.
-    fn has_gap(&self, way: &Jaywalk, pace: f64) -> bool {
+    /// True if no vehicle on any lane of the way arrives before the person has passed.
+    fn has_gap(&self, way: &Jaywalk, crosser: &Crosser) -> bool {
         way.spans.iter().all(|span| {
-            let (enters, leaves) = (span.across.0 / pace, span.across.1 / pace + 1.0);
+            let after = |metres: f64| (metres - crosser.progress) / crosser.pace;
+            let (enters, leaves) = (after(span.across.0), after(span.across.1) + 1.0);
             self.vehicles.iter().all(|vehicle| {
                 let Some(distance) = metres_to(self.network, vehicle, span) else {
                     return true;

@@ -6,7 +6,7 @@ use rand::Rng as _;
 
 use super::crosser::{Crosser, Jaywalk};
 use super::driver::DriverParameters;
-use super::people::Person;
+use super::people::{Person, draw_beside};
 use super::size::{draw_bicycle_size, draw_person_size, draw_real_size, draw_size};
 use super::vehicle::Vehicle;
 use super::{Body, TrafficSimulation};
@@ -49,7 +49,7 @@ pub(crate) struct Scenery {
     pub(crate) jaywalks: Vec<Jaywalk>,
     /// Pedestrians that use them: the index of the way, and the second of the simulation at which
     /// they start.
-    pub(crate) crossers: Vec<(usize, f64)>,
+    pub(crate) crossers: Vec<(usize, f64, f64)>,
 }
 
 /// A body that stays in place.
@@ -124,6 +124,7 @@ impl TrafficSimulation<'_> {
             let id = self.new_id();
             self.parked.push(Body {
                 id,
+                group: id,
                 kind: body.kind,
                 size: body.size,
                 pose: body.pose,
@@ -146,13 +147,12 @@ impl TrafficSimulation<'_> {
             vehicle.is_held = true;
             self.vehicles.push(vehicle);
         }
-        for (jaywalk, starts) in std::mem::take(&mut self.demand.scenery.crossers) {
+        for (jaywalk, pace, sets_off) in std::mem::take(&mut self.demand.scenery.crossers) {
             let id = self.new_id();
             let size = draw_person_size(&mut self.rng);
-            let pace = self.rng.random_range(1.1..2.2);
             let way = (jaywalk, &self.demand.scenery.jaywalks[jaywalk]);
-            let first = Crosser::new(id, size, way, pace, starts);
-            let aside = self.rng.random_range(0.9..1.2);
+            let first = Crosser::new(id, size, way, pace, sets_off);
+            let aside = draw_beside(&mut self.rng);
             if self.rng.random_bool(0.4) {
                 let id = self.new_id();
                 let size = draw_person_size(&mut self.rng);
@@ -441,7 +441,7 @@ impl TrafficSimulation<'_> {
         } else {
             let mut walk = walks[self.rng.random_range(0..walks.len())];
             let mut forward = self.rng.random_bool(0.5);
-            for _ in 0..4 {
+            for _ in 0..12 {
                 // People far from the centre are not visible, and most are where roads are crossed.
                 let track = &self.network.walks[walk].track;
                 let near = track.pose_at(track.length() / 2.0).position.length() < 75.0;
@@ -456,7 +456,7 @@ impl TrafficSimulation<'_> {
             let progress = self.rng.random_range(0.0..length);
             if self.demand.scenery.is_real {
                 // More people are near the corners: they come there when the scene is warm.
-                let left = self.rng.random_range(0.0..50.0_f64).min(length);
+                let left = self.rng.random_range(10.0..40.0_f64).min(length);
                 (walk, forward, progress.max(length - left))
             } else {
                 (walk, forward, progress)
@@ -466,8 +466,8 @@ impl TrafficSimulation<'_> {
         self.next_id += 1;
         let mut person = Person::new(id, self.network, (walk, forward, progress), &mut self.rng);
         if self.demand.scenery.is_real {
-            // Most pedestrians have company.
-            let n = [0, 0, 0, 1, 1, 2, 2, 3, 4, 6][self.rng.random_range(0..10)];
+            // Some pedestrians have company.
+            let n = [0, 0, 0, 0, 0, 0, 1, 1, 1, 3][self.rng.random_range(0..10)];
             person.accompany(self.next_id, n, &mut self.rng);
             self.next_id += n as i64;
         }
@@ -537,6 +537,7 @@ impl TrafficSimulation<'_> {
             self.next_id += 1;
             self.parked.push(Body {
                 id,
+                group: id,
                 kind: AgentKind::Vehicle,
                 size,
                 pose,

@@ -20,11 +20,11 @@ const TURN_RATE: f64 = 1.6;
 const CHANGE: f64 = 1.2;
 
 /// Metres between the rows of a group.
-const ROW: f64 = 1.35;
+const ROW: f64 = 1.2;
 /// Metres by which companions stand before or behind their row, and to the side of the one before
 /// them.
 const UNEVEN: f64 = 0.15;
-const BESIDE: std::ops::Range<f64> = 0.95..1.15;
+const BESIDE: std::ops::Range<f64> = 0.45..1.15;
 /// Metres between the places of a person that are kept, at least.
 const APART: f64 = 0.1;
 /// Greatest amplitude of swaying, metres.
@@ -34,10 +34,22 @@ const SWAY: f64 = 0.14;
 const CATCH_UP: f64 = 0.8;
 const HASTE: f64 = 1.5;
 
+/// Shares of those that reach a crosswalk that cross there, if they have to wait for a light and if not.
+/// Chosen by hand.
+const CROSSES: [f64; 2] = [0.15, 0.97];
+
+/// How often people pause, per second, and for how long, seconds: of the 424 pedestrians of
+/// `datasets/benchmarks/recorded.toml#train` 2.4 % stand and walk on within nine seconds.
+const PAUSES: f64 = 1.0 / 250.0;
+const PAUSE_S: std::ops::Range<f64> = 1.5..6.0;
+
+/// By how much people here walk more slowly than on plain scenes, m/s: fitted to the mean speed.
+const SLOWER_MPS: f64 = 0.1;
+
 /// Share of those alone that run or ride a scooter, and their speed, m/s: of 766 pedestrians of
-/// `datasets/benchmarks/recorded.toml#train` 1.4 % move at 2 m/s and more, at most at 4.9. One in ten
-/// is alone here.
-const RUN: f64 = 0.3;
+/// `datasets/benchmarks/recorded.toml#train` 1.4 % move at 2 m/s and more, at most at 4.9. Two in ten
+/// are alone here.
+const RUN: f64 = 0.12;
 const RUN_MPS: std::ops::Range<f64> = 2.4..4.9;
 
 /// The activity of a person at a crosswalk.
@@ -64,6 +76,12 @@ pub(crate) struct OnCrosswalk {
     pub(crate) activity: Activity,
 }
 
+/// How far to the side of each other people of a group walk, metres.
+pub(crate) fn draw_beside(rng: &mut Rng) -> f64 {
+    let part: f64 = rng.random_range(0.0..1.0);
+    BESIDE.start + (BESIDE.end - BESIDE.start) * part.powf(1.3)
+}
+
 /// A person on a walk.
 #[derive(Clone, Debug)]
 pub(crate) struct Person {
@@ -87,6 +105,8 @@ pub(crate) struct Person {
     left: Option<(usize, bool)>,
     /// Amplitude of swaying to the sides, metres, and its initial phase.
     sway: (f64, f64),
+    /// Seconds for which the person still pauses.
+    pause: f64,
 }
 
 /// A companion of a pedestrian, beside or behind on the same way.
@@ -169,6 +189,7 @@ impl Person {
             trail: VecDeque::new(),
             left: None,
             sway: (0.0, 0.0),
+            pause: 0.0,
         }
     }
 
@@ -176,6 +197,8 @@ impl Person {
     pub(crate) fn accompany(&mut self, first_id: i64, n: usize, rng: &mut Rng) {
         self.size = draw_person_size(rng);
         self.sway = (rng.random_range(0.0..SWAY), rng.random_range(0.0..TAU));
+        self.pace -= SLOWER_MPS;
+        self.speed = self.pace;
         if n == 0 && rng.random_bool(RUN) {
             self.pace = rng.random_range(RUN_MPS);
             self.speed = self.pace;
@@ -192,7 +215,7 @@ impl Person {
             let size = draw_person_size(rng);
             let place = DVec2::new(
                 -ROW * row + rng.random_range(-UNEVEN..UNEVEN),
-                side * rng.random_range(BESIDE),
+                side * draw_beside(rng),
             );
             self.companions.push(Companion {
                 id: first_id + k as i64,
@@ -211,6 +234,7 @@ impl Person {
     pub(crate) fn companions(&self) -> impl Iterator<Item = Body> + '_ {
         self.companions.iter().map(|companion| Body {
             id: companion.id,
+            group: self.id,
             size: companion.size,
             pose: companion.pose,
             ..self.body()
@@ -336,6 +360,7 @@ impl Person {
     pub(crate) fn body(&self) -> Body {
         Body {
             id: self.id,
+            group: self.id,
             kind: AgentKind::Pedestrian,
             size: self.size,
             pose: self.pose,
@@ -383,7 +408,10 @@ impl TrafficSimulation<'_> {
     pub(super) fn step_people(&mut self) {
         for i in 0..self.people.len() {
             let mut person = self.people[i].clone();
-            let limit = self.walking_limit(&mut person, i);
+            let mut limit = self.walking_limit(&mut person, i);
+            if self.demand.scenery.is_real && self.pauses(&mut person) {
+                limit = 0.0;
+            }
             let push = self.push_from_others(&person, i);
             person.advance(self.network, limit, push, self.dt);
             let length = self.network.walks[person.walk].track.length();
@@ -410,11 +438,7 @@ impl TrafficSimulation<'_> {
                 .min(walk.track.length() - crosswalk.on_road.1);
             let waiting = !matches!(person.activity, Some(Activity::Crosses { .. }));
             if waiting {
-                let width = crosswalk.on_road.1 - crosswalk.on_road.0;
-                let cycle = self.network.junctions[crosswalk.junction].cycle.as_ref();
-                let may_go = cycle.is_none_or(|cycle| {
-                    cycle.walk_time(crosswalk.leg, self.time) > 0.85 * width / person.pace
-                });
+                let may_go = self.may_go(index, person.pace);
                 if may_go && self.is_free_of_claims(index) {
                     person.activity = Some(Activity::Crosses {
                         forward: person.forward,
@@ -433,6 +457,23 @@ impl TrafficSimulation<'_> {
             person.activity = None;
         }
         self.limit_behind_others(person, i)
+    }
+
+    /// True if the lights leave enough time to cross at this pace, or there are none.
+    fn may_go(&self, crosswalk: usize, pace: f64) -> bool {
+        let crosswalk = &self.network.crosswalks[crosswalk];
+        let width = crosswalk.on_road.1 - crosswalk.on_road.0;
+        let cycle = self.network.junctions[crosswalk.junction].cycle.as_ref();
+        cycle.is_none_or(|cycle| cycle.walk_time(crosswalk.leg, self.time) > 0.85 * width / pace)
+    }
+
+    /// True while the person pauses beside the road, as at a window or a telephone.
+    fn pauses(&mut self, person: &mut Person) -> bool {
+        person.pause -= self.dt;
+        if person.pause < 0.0 && self.rng.random_bool(PAUSES * self.dt) {
+            person.pause = self.rng.random_range(PAUSE_S);
+        }
+        person.pause > 0.0 && self.network.walks[person.walk].crosswalk.is_none()
     }
 
     /// Slows down behind a slower pedestrian; of two that meet, the first in the list goes first.
@@ -491,14 +532,23 @@ impl TrafficSimulation<'_> {
             person.gone = true;
             return;
         }
-        // Most people that reach a crosswalk cross there.
         let crossing = choices
             .iter()
             .position(|(walk, _)| self.network.walks[*walk].crosswalk.is_some());
-        let crosses = self.demand.scenery.is_real && self.rng.random_bool(0.85);
+        let crosses = self.demand.scenery.is_real && {
+            let walk = crossing.map(|i| &self.network.walks[choices[i].0]);
+            let crosswalk = walk.and_then(|walk| walk.crosswalk);
+            let may_go = crosswalk.is_some_and(|crosswalk| self.may_go(crosswalk, person.pace));
+            self.rng.random_bool(CROSSES[usize::from(may_go)])
+        };
+        let stays = self.demand.scenery.is_real && !crosses;
+        let suits =
+            |(walk, _): &&(usize, bool)| !stays || self.network.walks[*walk].crosswalk.is_none();
+        let others: Vec<(usize, bool)> = choices.iter().filter(suits).copied().collect();
+        let others = if others.is_empty() { &choices } else { &others };
         let (walk, forward) = match crossing.filter(|_| crosses) {
             Some(crossing) => choices[crossing],
-            None => choices[self.rng.random_range(0..choices.len())],
+            None => others[self.rng.random_range(0..others.len())],
         };
         let has_crossed = self.network.walks[from].crosswalk.is_some();
         if has_crossed && !person.companions.is_empty() {

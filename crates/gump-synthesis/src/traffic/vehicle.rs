@@ -302,6 +302,7 @@ impl Vehicle {
     pub(crate) fn body(&self, network: &Network) -> Body {
         Body {
             id: self.id,
+            group: self.id,
             kind: self.kind,
             size: self.size,
             pose: self.pose(network),
