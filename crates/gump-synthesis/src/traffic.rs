@@ -26,9 +26,10 @@ use gump_scene::{AgentKind, LightState, Rng};
 use crate::network::{LaneIdx, Network};
 use beside::Narrow;
 use crosser::Crosser;
+use driver::Leader;
 use occupancy::Occupancy;
 use people::Person;
-use vehicle::Vehicle;
+use vehicle::{STANDS_MPS, Vehicle};
 
 /// Size and pose of a body, in the scene's frame.
 #[derive(Clone, Copy, Debug)]
@@ -162,7 +163,15 @@ impl<'a> TrafficSimulation<'a> {
             return -1.0;
         }
         let ahead = self.occupancy.leader(self.network, vehicle);
-        let stop = self.distance_to_stop(i).or_else(|| self.distance_to_end(i));
+        let ahead = ahead.map(|leader| match leader.speed < STANDS_MPS {
+            true => Leader {
+                gap: leader.gap - vehicle.short(),
+                ..leader
+            },
+            false => leader,
+        });
+        let stop = self.distance_to_stop(i).map(|left| left - vehicle.short());
+        let stop = stop.or_else(|| self.distance_to_end(i));
         let speed = vehicle.allowed_speed(self.network);
         vehicle
             .driver

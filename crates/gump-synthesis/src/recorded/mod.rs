@@ -168,14 +168,14 @@ fn draw_demand(
         .filter(|lane| lane.connector.is_none() && !lane.is_bike_lane())
         .map(|lane| lane.length())
         .sum();
-    // One vehicle per 24 m of lane is as much as flows.
-    let most = ((metres / 24.0) as usize).max(1);
+    // One vehicle per 16 m of lane is as much as flows.
+    let most = ((metres / 16.0) as usize).max(1);
     let fastest = network.lanes.iter().map(|lane| lane.speed_limit);
     let busy = match fastest.fold(0.0, f64::max) {
-        FREE_FLOW.. => 1.0,
-        FREEWAY_SPEED.. => 0.9,
-        WIDE_ROAD_SPEED.. => 1.5,
-        _ => 1.2,
+        FREE_FLOW.. => 2.5,
+        FREEWAY_SPEED.. => 2.1,
+        WIDE_ROAD_SPEED.. => 2.4,
+        _ => 1.7,
     };
     let moving = draw_skewed(&config.vehicles, 1.3, busy * config.density, rng).clamp(1, most);
     // How busy people and parking are goes together.

@@ -42,7 +42,7 @@ const PACE: Range<f64> = 0.9..1.9;
 /// Share of scenes in which a vehicle has stopped in its lane. Chosen by hand.
 const HELD: f64 = 0.12;
 /// Parked vehicles of a scene, at most, before density. Fitted by hand.
-const MOST_PARKED: f64 = 190.0;
+const MOST_PARKED: f64 = 215.0;
 
 /// Draws standing agents and crossing places; `bustle` from 0 to 1 sets the activity of the scene.
 pub(crate) fn draw(

@@ -13,7 +13,7 @@ use crate::network::LaneIdx;
 /// those like recorded ones, where minor roads cut lanes into short pieces. Chosen by hand; recorded
 /// vehicles at over 7 m/s move from a tenth of a lane to nine tenths in 4.1 s (median of nine).
 const ROOM_AFTER: [f64; 2] = [40.0, 12.0];
-const TAKES_S: [(f64, f64); 2] = [(3.4, 0.8), (4.6, 1.2)];
+const TAKES_S: [(f64, f64); 2] = [(3.4, 0.8), (5.1, 1.6)];
 const LONGEST_M: [f64; 2] = [70.0, 130.0];
 /// Deceleration that a change may impose on the vehicle behind, m/s²: a comfortable one. Chosen by
 /// hand.
