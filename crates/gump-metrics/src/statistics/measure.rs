@@ -16,6 +16,8 @@ pub enum Statistic {
     StopsAndGoes,
     /// Speed of moving agents, m/s.
     Speed,
+    /// Share of the steps of moving agents that are slower than 3 m/s.
+    Crawling,
     /// Acceleration along the heading of moving agents, m/s².
     Acceleration,
     /// Absolute yaw rate of moving agents, rad/s.
@@ -36,6 +38,11 @@ pub enum Statistic {
     FastTurn,
     /// Gap to the agent ahead in the same direction within 50 m, of agents on a lane, m.
     Gap,
+    /// Time to where the agent ahead is now, seconds: that gap over the speed, of agents above 5 m/s whose
+    /// leader is at least half as fast.
+    Headway,
+    /// Distance from a walking pedestrian to the nearest other one, centre to centre, at most 10 m.
+    Company,
     /// Length of a track's box, m.
     Length,
     /// Width of a track's box, m.
@@ -102,13 +109,14 @@ pub enum Statistic {
 
 impl Statistic {
     /// Every measure.
-    pub const ALL: [Self; 47] = [
+    pub const ALL: [Self; 50] = [
         Self::Standing,
         Self::Parked,
         Self::ParkedOffLane,
         Self::ParkedLaneDistance,
         Self::StopsAndGoes,
         Self::Speed,
+        Self::Crawling,
         Self::Acceleration,
         Self::YawRate,
         Self::SpeedChange1To4,
@@ -119,6 +127,8 @@ impl Statistic {
         Self::SpeedChangeAbove22,
         Self::FastTurn,
         Self::Gap,
+        Self::Headway,
+        Self::Company,
         Self::Length,
         Self::Width,
         Self::Agents,
@@ -161,6 +171,7 @@ impl Statistic {
             Self::ParkedLaneDistance => "parked_lane_distance",
             Self::StopsAndGoes => "stops_and_goes",
             Self::Speed => "speed",
+            Self::Crawling => "crawling",
             Self::Acceleration => "acceleration",
             Self::YawRate => "yaw_rate",
             Self::SpeedChange1To4 => "speed_change_1_to_4",
@@ -171,6 +182,8 @@ impl Statistic {
             Self::SpeedChangeAbove22 => "speed_change_above_22",
             Self::FastTurn => "fast_turn",
             Self::Gap => "gap",
+            Self::Headway => "headway",
+            Self::Company => "company",
             Self::Length => "length",
             Self::Width => "width",
             Self::Agents => "agents",
@@ -218,6 +231,7 @@ impl Statistic {
             | Self::Parked
             | Self::ParkedOffLane
             | Self::StopsAndGoes
+            | Self::Crawling
             | Self::BeginsLate
             | Self::EndsEarly
             | Self::Interrupted
@@ -238,6 +252,7 @@ impl Statistic {
             | Self::SpeedChangeAbove22 => (-20.0, 20.0, 80),
             Self::FastTurn => (0.0, 0.2, 80),
             Self::Gap => (0.0, 50.0, 50),
+            Self::Headway | Self::Company => (0.0, 10.0, 100),
             Self::Length => (0.0, 16.0, 64),
             Self::Width => (0.0, 4.0, 40),
             Self::Agents | Self::AgentsNear | Self::Tracks => (0.0, 200.0, 50),

@@ -208,12 +208,20 @@ mod tests {
         // Boxes of 4.5 m, 20 m apart.
         let gap = statistics.get(M::Gap, VEHICLE).unwrap();
         assert!((gap.mean() - 15.5).abs() < 1.0, "{}", gap.mean());
+        let headway = statistics.get(M::Headway, VEHICLE).unwrap();
+        assert_eq!(headway.n(), gap.n());
+        assert!((headway.mean() - gap.mean() / 8.0).abs() < 1e-9);
+        assert_eq!(mean(&statistics, M::Crawling, VEHICLE), 0.0);
         assert_eq!(mean(&statistics, M::LateralOffset, VEHICLE), 0.5);
         assert_eq!(mean(&statistics, M::Agents, VEHICLE), 3.0);
         assert_eq!(
             mean(&statistics, M::OnCrosswalk, Some(AgentKind::Pedestrian)),
             0.0
         );
+        // Too slow to walk: it moves at 0.4 m/s.
+        let people = Some(AgentKind::Pedestrian);
+        assert!(statistics.get(M::Company, people).is_none());
+        assert_eq!(mean(&statistics, M::Crawling, people), 1.0);
         assert_eq!(mean(&statistics, M::EgoSpeed, None), 8.0);
         assert_eq!(mean(&statistics, M::Lanes, None), 1.0);
         assert_eq!(mean(&statistics, M::Jitter, VEHICLE), 0.0);
@@ -247,6 +255,24 @@ mod tests {
         assert!((follows(M::SpeedChange12To16) + 2.0).abs() < 1e-9);
         assert_eq!(follows(M::SpeedChange1To4), 0.0);
         assert!((follows(M::FastTurn) - 0.1).abs() < 1e-9);
+    }
+
+    #[test]
+    fn people_side_by_side_are_company() {
+        let statistics = counted(
+            "lane 1: 0,0 300,0
+             ego vehicle 0: 10,0.5
+             agent pedestrian 1: 60,5 velocity 1.2,0
+             agent pedestrian 2: 60,5.7 velocity 1.2,0
+             agent pedestrian 3: 90,5 velocity 1.2,0
+             history 1 future 2 dt 0.1",
+        );
+        let company = mean(&statistics, M::Company, Some(AgentKind::Pedestrian));
+        assert!(
+            (company - (0.7 + 0.7 + 10.0) / 3.0).abs() < 1e-9,
+            "{company}"
+        );
+        assert!(statistics.get(M::Company, VEHICLE).is_none());
     }
 
     #[test]

@@ -23,6 +23,8 @@ const LONG_ENOUGH_S: f64 = 2.0;
 const LOOK_EVERY_S: f64 = 1.0;
 /// Metres around the ego in which an agent is near.
 const NEAR: f64 = 60.0;
+/// Slower moving agents crawl, m/s.
+const CRAWLS: f64 = 3.0;
 /// How far ahead changes of speed look, seconds.
 const CHANGE_S: f64 = 4.0;
 /// Over how long fast turns are measured, seconds.
@@ -100,6 +102,7 @@ fn note_track(scenario: &Scenario, track: &Track<'_>, is_ego: bool, statistics: 
         statistics.note_if(M::Standing, class, speed < STANDING);
         if speed >= STANDING {
             statistics.note(M::Speed, class, speed);
+            statistics.note_if(M::Crawling, class, speed < CRAWLS);
         }
         if parked {
             statistics.note(M::ParkedSpeed, class, speed);

@@ -20,6 +20,9 @@ const FARTHEST_LANE: f64 = 20.0;
 const FARTHEST_LEADER: f64 = 50.0;
 /// Maximum lateral offset of a leader's centre, metres.
 const LEADER_ASIDE: f64 = 1.5;
+/// Slower agents wait rather than follow, m/s; slower pedestrians stand.
+const FOLLOWS: f64 = 5.0;
+const WALKS: f64 = 0.5;
 /// Metres around an agent in which others are neighbours.
 const NEIGHBOURHOOD: f64 = 10.0;
 /// Maximum distance of a lane of an intersection to another of the same, metres.
@@ -95,16 +98,26 @@ pub(super) fn note_room(scenario: &Scenario, step: usize, to: &mut Statistics) {
         }
         let drives = agent.kind != AgentKind::Pedestrian && has_lanes;
         if drives
-            && let Some(gap) = gap(agent, others())
+            && let Some((gap, leader)) = leader(agent, others())
             && lane_offset(&scenario.map, agent).is_some_and(|off| off < OFF_LANE)
         {
             to.note(M::Gap, class, gap);
+            let speed = agent.state.speed();
+            if speed > FOLLOWS && leader.state.speed() > speed / 2.0 {
+                to.note(M::Headway, class, gap / speed);
+            }
+        }
+        let walks = agent.kind == AgentKind::Pedestrian && agent.state.speed() > WALKS;
+        if walks {
+            let people = others().filter(|other| other.kind == AgentKind::Pedestrian);
+            let apart = people.map(|other| other.state.pose.position.distance(here));
+            to.note(M::Company, class, apart.fold(NEIGHBOURHOOD, f64::min));
         }
     }
 }
 
-/// Gap to the agent ahead with the same heading, metres.
-fn gap<'a>(agent: &Agent, others: impl Iterator<Item = &'a Agent>) -> Option<f64> {
+/// Gap to the agent ahead with the same heading, metres, and that agent.
+fn leader<'a>(agent: &Agent, others: impl Iterator<Item = &'a Agent>) -> Option<(f64, &'a Agent)> {
     let pose = agent.state.pose;
     let ahead = others.filter_map(|other| {
         let local = pose.inverse() * other.state.pose.position;
@@ -115,9 +128,9 @@ fn gap<'a>(agent: &Agent, others: impl Iterator<Item = &'a Agent>) -> Option<f64
             && local.y.abs() < LEADER_ASIDE
             && turn < ALIGNED
             && gap < FARTHEST_LEADER;
-        leads.then_some(gap.max(0.0))
+        leads.then_some((gap.max(0.0), other))
     });
-    ahead.reduce(f64::min)
+    ahead.min_by(|a, b| a.0.total_cmp(&b.0))
 }
 
 /// Records properties of the road.

@@ -128,7 +128,7 @@ fn parked(network: &Network, rng: &mut Rng) -> Vec<Standing> {
 /// The share of places that are taken; rows are mostly nearly full, or nearly empty.
 fn draw_fill(rng: &mut Rng) -> f64 {
     let part: f64 = rng.random_range(0.0_f64..1.0).powf(0.4);
-    0.1 + 0.88 * (0.55 - (std::f64::consts::PI * part).cos() / 2.0).clamp(0.0, 1.0)
+    0.1 + 0.88 * (0.55 - (PI * part).cos() / 2.0).clamp(0.0, 1.0)
 }
 
 fn park_along(strip: &Track, rng: &mut Rng, all: &mut Vec<Standing>) {
@@ -153,11 +153,7 @@ fn park_along(strip: &Track, rng: &mut Rng, all: &mut Vec<Standing>) {
             rng.random_range(-0.03..0.03),
         );
         let on_strip = strip.pose_at(s + size[0] / 2.0);
-        let against = if rng.random_bool(0.06) {
-            std::f64::consts::PI
-        } else {
-            0.0
-        };
+        let against = if rng.random_bool(0.06) { PI } else { 0.0 };
         let pose = on_strip * local;
         all.push(Standing {
             kind: AgentKind::Vehicle,
@@ -177,7 +173,7 @@ fn in_bay(middle: Pose, rng: &mut Rng) -> Standing {
     size[0] = size[0].min(LONGEST[1]);
     size[1] = size[1].min(WIDEST[1]);
     let nose_in = if rng.random_bool(0.75) { -0.5 } else { 0.5 };
-    let turn = nose_in * std::f64::consts::PI + rng.random_range(-0.04..0.04);
+    let turn = nose_in * PI + rng.random_range(-0.04..0.04);
     let local = Pose::new(
         rng.random_range(-0.12..0.12),
         rng.random_range(-0.25..0.15),
