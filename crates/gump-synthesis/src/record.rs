@@ -77,6 +77,19 @@ impl Recording {
         }
     }
 
+    /// Moves a vehicle of traffic through these poses, off its lanes.
+    pub(crate) fn turn_off(&mut self, id: i64, poses: Vec<Option<Pose>>) {
+        self.move_along(id, poses);
+        if let Some(track) = self.tracks.get_mut(&id) {
+            track.places.clear();
+        }
+    }
+
+    /// The track of a body.
+    pub(crate) fn track(&self, id: i64) -> Option<&Track> {
+        self.tracks.get(&id)
+    }
+
     /// An unused id.
     pub(crate) fn new_id(&self) -> i64 {
         self.tracks.keys().next_back().map_or(0, |last| last + 1)

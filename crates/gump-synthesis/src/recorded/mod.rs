@@ -2,7 +2,7 @@
 //!
 //! `dress` adds side roads, car parks and parking to a plan, `bumps`, `driveways` and `islands` what
 //! their names say; `scenery` adds parked vehicles, standing pedestrians and crossing ones anywhere on the
-//! network; `manoeuvres` and `walkers` add motion in car parks; `turns` changes how the map shows
+//! network; `manoeuvres`, `turn_ins` and `walkers` add motion in car parks and driveways; `turns` changes how the map shows
 //! turns; this module combines them. Numbers and shares are fitted by hand to
 //! `configs/targets/waymo-like.toml` (docs/results/0017-recorded-like.md); distances that no target
 //! measures are chosen by eye.
@@ -13,6 +13,7 @@ mod driveways;
 mod islands;
 mod manoeuvres;
 mod scenery;
+mod turn_ins;
 mod turns;
 mod walkers;
 
@@ -121,6 +122,13 @@ pub(crate) fn draw_scenario(
     }
     let mut parking_rng = seed.fork(attempt).fork(2).rng();
     manoeuvres::add(&mut recording, &network, config.dt, &mut parking_rng);
+    turn_ins::add(
+        &mut recording,
+        &network,
+        &driveways,
+        config.dt,
+        &mut parking_rng,
+    );
     walkers::add(&mut recording, &network, config.dt, &mut parking_rng);
     walkers::shift(&mut recording, config.dt, &mut parking_rng);
     let ego = choose_ego(&recording, config.now(), &mut rng)?;
