@@ -400,3 +400,57 @@ fn approach(road: &Track, (s, y): (f64, f64), curb: Pose, rng: &mut Rng) -> Vec<
     points.extend(connect(at(n), curb, [0.0; 2], CORNER));
     points
 }
+
+#[cfg(test)]
+mod tests {
+    use gump_geometry::angle_difference;
+    use gump_scene::Seed;
+
+    use super::*;
+    use crate::RoadFamily;
+    use crate::layout::{Winding, draw_plan};
+
+    #[test]
+    fn ways_across_lead_along_sidewalks_and_straight_from_curb_to_curb() {
+        let mut n = 0;
+        for seed in 0..8 {
+            let mut rng = Seed(seed).rng();
+            let plan = draw_plan(RoadFamily::Arterial, 150.0, Winding::Slight, &mut rng);
+            let network = Network::new(&plan, &mut rng);
+            for way in draw_jaywalks(&network, &mut rng) {
+                n += 1;
+                let (from, to) = way.curbs;
+                assert!(0.0 <= from && from < to && to <= way.track.length());
+                let points = way.track.points();
+                let steps = points.windows(2).map(|p| p[0].distance(p[1]));
+                let longest = steps.fold(0.0, f64::max);
+                assert!(longest < 1.1, "{longest} m");
+                // Straight across: the directions at both curbs agree.
+                let turn = angle_difference(
+                    way.track.pose_at(from + 1.0).heading,
+                    way.track.pose_at(to - 1.0).heading,
+                );
+                assert!(turn.abs() < 0.1, "{turn}");
+                let across = |span: &Span| from - 0.1 < span.across.0 && span.across.1 < to + 0.1;
+                assert!(!way.spans.is_empty() && way.spans.iter().all(across));
+                // Nobody walks on a lane before the curb or after it.
+                for s in [0.0, from / 2.0, from - 0.5, to + 0.5, way.track.length()] {
+                    if (from..to).contains(&s) || s < 0.0 {
+                        continue;
+                    }
+                    let at = way.track.pose_at(s).position;
+                    let lanes = network.lanes.iter().filter(|lane| lane.connector.is_none());
+                    let mut feet = lanes.map(|lane| {
+                        let foot = lane.track.pose_at(lane.track.project(at)).position;
+                        (foot.distance(at), lane.width)
+                    });
+                    assert!(
+                        feet.all(|(far, width)| far > width / 2.0),
+                        "{s} of {from} to {to}"
+                    );
+                }
+            }
+        }
+        assert!(n > 8, "{n}");
+    }
+}

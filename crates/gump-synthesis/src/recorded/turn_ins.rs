@@ -201,3 +201,74 @@ fn way_in(
     // It has left the road, at least with its front.
     (s > begins + 3.0).then_some((way, turn.pose_at(turn.length()), ROOM_M[side]))
 }
+
+#[cfg(test)]
+mod tests {
+    use gump_scene::Seed;
+
+    use super::*;
+
+    const DT: f64 = 0.1;
+
+    /// A vehicle at a constant speed along the x axis, and a driveway on its right, 60 m ahead.
+    fn street(speed: f64) -> (Vec<Pose>, Driveway) {
+        let poses = (0..93).map(|i| Pose::new(f64::from(i) * DT * speed, 0.0, 0.0));
+        let driveway = Driveway {
+            curb: Pose::new(60.0, -3.0, -std::f64::consts::PI),
+            width: 5.0,
+        };
+        (poses.collect(), driveway)
+    }
+
+    #[test]
+    fn a_vehicle_slows_down_and_turns_into_the_yard() {
+        let (poses, driveway) = street(10.0);
+        let mut n = 0;
+        for seed in 0..100 {
+            let mut rng = Seed(seed).rng();
+            let Some((way, end, _)) = way_in(&poses, &driveway, DT, &mut rng) else {
+                continue;
+            };
+            n += 1;
+            assert_eq!(way.len(), poses.len());
+            let inside = driveway.curb.inverse() * end.position;
+            assert!(inside.y > 4.9 && inside.x.abs() < 1.0, "{inside}");
+            let mut before = 10.0;
+            for pair in way.windows(2) {
+                let step = pair[1].position - pair[0].position;
+                let speed = step.length() / DT;
+                let (change, turn) = (
+                    (speed - before) / DT,
+                    angle_difference(pair[1].heading, pair[0].heading),
+                );
+                assert!((-4.5..1.5).contains(&change), "seed {seed}: {change} m/s²");
+                assert!(turn.abs() < 0.3 * speed * DT + 0.02, "seed {seed}: {turn}");
+                let aside = step.dot(pair[0].direction().perp()).abs();
+                assert!(aside < 0.06, "seed {seed}: {aside} m aside");
+                before = speed;
+            }
+            let last = driveway.curb.inverse() * way[way.len() - 1].position;
+            assert!(last.y > -3.0 && last.x < 12.0, "{last}");
+        }
+        assert!(n > 30, "{n}");
+    }
+
+    #[test]
+    fn who_is_too_fast_or_does_not_pass_goes_on() {
+        let (poses, driveway) = street(24.0);
+        let near = Driveway {
+            curb: Pose::new(16.0, -3.0, -std::f64::consts::PI),
+            ..driveway
+        };
+        let far = Driveway {
+            curb: Pose::new(60.0, -30.0, -std::f64::consts::PI),
+            ..driveway
+        };
+        for driveway in [near, far] {
+            for seed in 0..20 {
+                let mut rng = Seed(seed).rng();
+                assert!(way_in(&poses, &driveway, DT, &mut rng).is_none());
+            }
+        }
+    }
+}
