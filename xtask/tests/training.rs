@@ -322,6 +322,8 @@ fn the_recorded_stages_of_the_relative_network_can_be_run() {
         let network = relative::load(&weights, &Device::Cpu).unwrap();
         assert_eq!(network.config(), shipped.config());
     }
+    on_these("relative-8.toml");
+    place.results("relative-8.toml --steps 1", "on");
     on_these("relative-parking.toml");
     place.results("relative-parking.toml --steps 1", "parking");
     on_these("placement.toml");
