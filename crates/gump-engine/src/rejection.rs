@@ -178,6 +178,12 @@ impl Footprints {
             .collect()
     }
 
+    /// True if the path of an object leaves the road.
+    pub(crate) fn leaves_road(&self, i: usize) -> bool {
+        let member = &self.members[i];
+        member.places_on_road(&member.ahead) < member.ahead.len()
+    }
+
     /// Accepts a draw of an object if it stays clear of all others, and on the road, longer than
     /// the present one.
     pub(crate) fn improve(&mut self, i: usize, ahead: &Way) -> bool {

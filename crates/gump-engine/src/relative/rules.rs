@@ -451,8 +451,8 @@ pub struct Driven {
     pub is_heeded: bool,
 }
 
-/// Redraws moves that are not clear, up to `redraws` times each; an agent without a clear path
-/// brakes. Vehicles may not leave the road, except where `may_leave` holds for their index.
+/// Redraws moves that are not clear, up to `redraws` times each; a vehicle that would leave the road with all
+/// of them steers back, and an agent without a clear path brakes. Vehicles may not leave the road, except where `may_leave` holds for their index.
 pub fn resolve(
     agents: &[Shown],
     driven: Option<Driven>,
@@ -493,6 +493,17 @@ pub fn resolve(
             }
         }
     }
+    for i in crowd.unclear(0).into_iter().filter(|&i| !may_leave(i)) {
+        for turn in STEERS_RAD {
+            let step = steered(moves[i], turn);
+            if crowd.leaves_road(i)
+                && holds(&agents[i], turn)
+                && crowd.improve(i, &ahead(agents[i].pose, step))
+            {
+                moves[i] = step;
+            }
+        }
+    }
     for i in crowd.unclear(0) {
         let Some((step, way)) = braking(&agents[i], moves[i]) else {
             continue;
@@ -501,6 +512,26 @@ pub fn resolve(
             moves[i] = step;
         }
     }
+}
+
+/// Turns within a move that are tried for a vehicle that would leave the road, radians, the slightest first.
+const STEERS_RAD: [f64; 10] = [
+    0.04, -0.04, 0.08, -0.08, 0.12, -0.12, 0.16, -0.16, 0.2, -0.2,
+];
+/// The acceleration to the side that such a turn may take, metres per second squared: half of what a dry road
+/// holds.
+const STEERS_MPS2: f64 = 4.0;
+
+/// A move of the same length that turns by so much.
+fn steered(step: Pose, turn: f64) -> Pose {
+    let length = step.position.length();
+    let (sin, cos) = (turn / 2.0).sin_cos();
+    Pose::new(length * cos, length * sin, turn)
+}
+
+/// True if a dry road allows a turn by so much within a move.
+fn holds(now: &Shown, turn: f64) -> bool {
+    now.velocity().length() * turn.abs() / TOKEN_DT <= STEERS_MPS2
 }
 
 /// The path of an agent that continues as in the next half second, but turns less and less.
