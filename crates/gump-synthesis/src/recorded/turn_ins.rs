@@ -22,7 +22,7 @@ use crate::record::Recording;
 // 154 of `datasets/benchmarks/recorded.toml#train` on a lane, at 0.5 to 10 m/s and with a driveway within
 // 40 m ahead, 3.9 % leave the road within eight seconds.
 /// Vehicles of a scene that turn in, at most, and driveways tried for each.
-const MOST: usize = 3;
+const MOST: usize = 2;
 const TRIED: usize = 8;
 /// Longest such vehicle, metres.
 const LONGEST: f64 = 6.2;
