@@ -124,9 +124,8 @@ impl Recording {
         self.lights.iter_mut().for_each(Vec::clear);
     }
 
-    /// Removes pedestrians and parked vehicles whose boxes overlap those of others, people of one group
-    /// excepted; false if two boxes of
-    /// traffic overlap.
+    /// Removes pedestrians and parked vehicles whose boxes overlap those of others, people of one
+    /// group excepted; false if two boxes of traffic overlap.
     pub(crate) fn part_bodies(&mut self) -> bool {
         let mut out = BTreeSet::new();
         for frame in 0..self.n_frames {

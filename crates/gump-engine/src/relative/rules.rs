@@ -451,8 +451,9 @@ pub struct Driven {
     pub is_heeded: bool,
 }
 
-/// Redraws moves that are not clear, up to `redraws` times each; a vehicle that would leave the road with all
-/// of them steers back, and an agent without a clear path brakes. Vehicles may not leave the road, except where `may_leave` holds for their index.
+/// Redraws moves that are not clear, up to `redraws` times each; a vehicle that would leave the road
+/// with all of them steers back, and an agent without a clear path brakes. Vehicles may not leave the
+/// road, except where `may_leave` holds for their index.
 pub fn resolve(
     agents: &[Shown],
     driven: Option<Driven>,
@@ -514,17 +515,18 @@ pub fn resolve(
     }
 }
 
-/// Turns within a move that are tried for a vehicle that would leave the road, radians, the slightest first.
+/// Turns within a move that are tried for a vehicle that would leave the road, radians, the slightest
+/// first.
 const STEERS_RAD: [f64; 10] = [
     0.04, -0.04, 0.08, -0.08, 0.12, -0.12, 0.16, -0.16, 0.2, -0.2,
 ];
-/// The acceleration to the side that such a turn may take, metres per second squared: half of what a dry road
-/// holds.
-const STEERS_MPS2: f64 = 4.0;
+/// The acceleration to the side that such a turn may take, metres per second squared: half of what a
+/// dry road holds.
+const STEERS_MPS2: f64 = GRIP_MPS2 / 2.0;
 
-/// A move of the same length that turns by so much.
+/// A move of the same length, forwards or backwards, that turns by so much.
 fn steered(step: Pose, turn: f64) -> Pose {
-    let length = step.position.length();
+    let length = step.position.length().copysign(step.position.x);
     let (sin, cos) = (turn / 2.0).sin_cos();
     Pose::new(length * cos, length * sin, turn)
 }
@@ -621,6 +623,19 @@ mod tests {
         );
         assert_eq!(calls, [(vec![0], 0), (vec![0], 1)]);
         assert_eq!(moves, [straight(1.0), Pose::IDENTITY]);
+    }
+
+    #[test]
+    fn who_steers_back_keeps_pace_gear_and_grip() {
+        for step in [straight(6.0), straight(-0.5)] {
+            let turned = steered(step, -0.16);
+            let length = turned.position.length();
+            assert!((length - step.position.length()).abs() < 1e-9);
+            assert!(turned.position.x * step.position.x > 0.0, "{turned:?}");
+            assert!(turned.position.y * step.position.x < 0.0, "{turned:?}");
+        }
+        // A step of 6 m is 12 m/s: 0.16 rad take 3.8 m/s², 0.2 rad 4.8.
+        assert!(holds(&car(0.0, 6.0), 0.16) && !holds(&car(0.0, 6.0), -0.2));
     }
 
     #[test]

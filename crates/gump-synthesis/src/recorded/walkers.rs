@@ -63,7 +63,7 @@ pub(crate) fn shift(recording: &mut Recording, dt: f64, rng: &mut Rng) {
         }
         let poses = steps(body.pose, recording.n_snapshots(), dt, rng);
         let size = [body.size[0], body.size[1]];
-        if is_clear(recording, body.group, size, [0.05, 0.5], &poses) {
+        if is_clear(recording, body.group, size, ROOM_M[0], &poses) {
             recording.move_along(body.id, poses);
         }
     }

@@ -47,8 +47,8 @@ const PAUSE_S: std::ops::Range<f64> = 1.5..6.0;
 const SLOWER_MPS: f64 = 0.1;
 
 /// Share of those alone that run or ride a scooter, and their speed, m/s: of 766 pedestrians of
-/// `datasets/benchmarks/recorded.toml#train` 1.4 % move at 2 m/s and more, at most at 4.9. Two in ten
-/// are alone here.
+/// `datasets/benchmarks/recorded.toml#train` 1.4 % move at 2 m/s and more, at most at 4.9. Four in ten
+/// of those on sidewalks are alone here.
 const RUN: f64 = 0.12;
 const RUN_MPS: std::ops::Range<f64> = 2.4..4.9;
 
