@@ -269,7 +269,7 @@ fn aisle(rng: &mut Rng) -> RoadPlan {
         parking: true,
         bays: true,
         sidewalks: false,
-        speed_limit: rng.random_range(3.5..5.5),
+        speed_limit: rng.random_range(2.6..5.5),
         ..street(1, false, rng)
     }
 }

@@ -37,15 +37,15 @@ use crate::{RoadFamily, SynthesisConfig};
 /// Weights of the families: recordings are made in towns, rarely on motorways. Fitted by hand in
 /// several rounds, towards traffic as fast as recorded one.
 const FAMILIES: [(RoadFamily, u32); 9] = [
-    (RoadFamily::SignalizedCrossing, 32),
-    (RoadFamily::StopCrossing, 18),
+    (RoadFamily::SignalizedCrossing, 14),
+    (RoadFamily::StopCrossing, 30),
     (RoadFamily::TeeJunction, 6),
     (RoadFamily::Roundabout, 2),
     (RoadFamily::Arterial, 48),
-    (RoadFamily::CurvedRoad, 12),
+    (RoadFamily::CurvedRoad, 20),
     (RoadFamily::OnRamp, 30),
-    (RoadFamily::MidBlockCrosswalk, 6),
-    (RoadFamily::Grid, 14),
+    (RoadFamily::MidBlockCrosswalk, 4),
+    (RoadFamily::Grid, 12),
 ];
 // Some formats state no limits, signs or lights (docs/decisions/0014-unknown-inputs.md). The shares
 // are chosen by hand, so that a network meets both.
@@ -54,7 +54,7 @@ const NO_LIMITS: f64 = 0.5;
 /// Share of scenes whose map states no stop signs, though drivers comply with them.
 const NO_SIGNS: f64 = 0.12;
 /// Share of scenes with lights whose lights are not recorded.
-const NO_LIGHTS: f64 = 0.3;
+const NO_LIGHTS: f64 = 0.12;
 /// Share of scenes whose map has no lanes in car parks.
 const UNMAPPED_CAR_PARKS: f64 = 0.7;
 /// Share of these whose road edges run across the mouths of car parks and yards, as they do across

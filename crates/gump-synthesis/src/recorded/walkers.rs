@@ -45,10 +45,10 @@ const CHANGE: f64 = 1.2;
 /// Share of those that walk away from a vehicle that appear when they begin to, and of those that walk
 /// to one that vanish when they are there.
 const GETS_OUT: f64 = 0.85;
-const GETS_IN: f64 = 0.75;
+const GETS_IN: f64 = 0.9;
 /// Share of standing people that take a few steps, how far, metres, and how fast, m/s. Of those that stand
 /// in recordings at all a fifth do so within nine seconds, and stand again.
-const STEPS: f64 = 0.6;
+const STEPS: f64 = 0.55;
 const STEPS_M: std::ops::Range<f64> = 0.5..2.5;
 const STEPS_MPS: std::ops::Range<f64> = 0.4..0.9;
 
@@ -196,7 +196,10 @@ fn way(parked: &[OrientedBox], n: usize, dt: f64, rng: &mut Rng) -> Option<Vec<O
         })
         .collect();
     let pace: f64 = rng.random_range(0.8..1.8);
-    let starts: f64 = rng.random_range(-20.0..8.0);
+    let starts: f64 = match begins_inside {
+        true => rng.random_range(-20.0..8.0),
+        false => rng.random_range(-25.0..0.0),
+    };
     let mut pose = Pose {
         position: from,
         heading: wrap_angle((to - from).to_angle() + rng.random_range(-0.4..0.4)),

@@ -75,6 +75,10 @@ const BICYCLE_ASIDE: f64 = 1.35;
 /// From this limit on a lane of a scene like a recorded one is fully used, m/s. Fitted by hand:
 /// recorded traffic drives faster than a plain draw of lanes.
 const FAST_LANE: f64 = 16.0;
+/// A lane of a freeway is one of a ramp if others have a limit this many times as high; so much less it is
+/// used. Chosen by hand: merging holds freeways up, on which nobody comes to rest in recordings.
+const RAMP: f64 = 1.1;
+const ON_RAMPS: f64 = 0.5;
 
 impl TrafficSimulation<'_> {
     /// Fills the network once, before the first step.
@@ -234,8 +238,16 @@ impl TrafficSimulation<'_> {
 
     /// Random: faster lanes are used more; uniform in plain scenes.
     fn is_used(&mut self, lane: LaneIdx) -> bool {
-        let share = self.network.lanes[lane].speed_limit / FAST_LANE;
-        !self.demand.scenery.is_real || self.rng.random_bool(share.powi(3).clamp(0.04, 1.0))
+        if !self.demand.scenery.is_real {
+            return true;
+        }
+        let lanes = &self.network.lanes;
+        let is_freeway = lanes[lane].kind == gump_scene::LaneKind::Freeway;
+        let limit = lanes[lane].speed_limit;
+        let is_ramp = is_freeway && lanes.iter().any(|other| other.speed_limit > RAMP * limit);
+        let share = (limit / FAST_LANE).powi(3).clamp(0.08, 1.0);
+        self.rng
+            .random_bool(if is_ramp { ON_RAMPS * share } else { share })
     }
 
     fn count(&self, kind: AgentKind) -> usize {

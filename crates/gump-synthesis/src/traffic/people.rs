@@ -34,13 +34,14 @@ const SWAY: f64 = 0.14;
 const CATCH_UP: f64 = 0.8;
 const HASTE: f64 = 1.5;
 
-/// Shares of those that reach a crosswalk that cross there, if they have to wait for a light and if not.
+/// Shares of those that reach a crosswalk that cross there, if they have to wait for a light or a vehicle and
+/// if not.
 /// Chosen by hand.
-const CROSSES: [f64; 2] = [0.15, 0.97];
+const CROSSES: [f64; 2] = [0.1, 0.97];
 
-/// How often people pause, per second, and for how long, seconds: of the 424 pedestrians of
+/// How often people pause on sidewalks, per second, and for how long, seconds: of all 424 pedestrians of
 /// `datasets/benchmarks/recorded.toml#train` 2.4 % stand and walk on within nine seconds.
-const PAUSES: f64 = 1.0 / 250.0;
+const PAUSES: f64 = 1.0 / 500.0;
 const PAUSE_S: std::ops::Range<f64> = 1.5..6.0;
 
 /// By how much people here walk more slowly than on plain scenes, m/s: fitted to the mean speed.
@@ -538,8 +539,10 @@ impl TrafficSimulation<'_> {
         let crosses = self.demand.scenery.is_real && {
             let walk = crossing.map(|i| &self.network.walks[choices[i].0]);
             let crosswalk = walk.and_then(|walk| walk.crosswalk);
-            let may_go = crosswalk.is_some_and(|crosswalk| self.may_go(crosswalk, person.pace));
-            self.rng.random_bool(CROSSES[usize::from(may_go)])
+            let goes_at_once = crosswalk.is_some_and(|crosswalk| {
+                self.may_go(crosswalk, person.pace) && self.is_free_of_claims(crosswalk)
+            });
+            self.rng.random_bool(CROSSES[usize::from(goes_at_once)])
         };
         let stays = self.demand.scenery.is_real && !crosses;
         let suits =
