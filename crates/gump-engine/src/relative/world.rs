@@ -33,7 +33,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::EngineError;
 use crate::nucleus::uniform;
-use crate::relative::engine::{Draw, KEPT, MapMemory, RelativeEngine, Workspace};
+use crate::relative::engine::{Draw, KEPT, MapMemory, Reach, RelativeEngine, Workspace};
 use crate::relative::intent::Intent;
 use crate::relative::rules::{
     Driven, HALTS, Known, RESOLVES, STARTS, Shut, StopLine, draw_again, kinematically_limited,
@@ -141,8 +141,8 @@ pub struct RelativeSampling {
     /// Divides the logits; above 1 gives more varied draws.
     pub temperature: f64,
     /// Nucleus of the distance ahead: draws are among the most likely bins that together have this
-    /// probability. Of sideways moves and turns 0.4 of that tail is cut off; whether to stand is drawn
-    /// from both.
+    /// probability. Of sideways moves and turns 0.4 of that tail is cut off. Whether to stand is drawn
+    /// however unlikely it is by those who are slow, and by people.
     pub top_p: f64,
     /// Maximum number of redraws of an agent that would overlap another or leave the road within
     /// 1.5 s.
@@ -576,7 +576,9 @@ impl Future {
         let ego = |i: usize| egos.map(|egos| egos[i]);
         let streams: Vec<Vec<Seed>> = futures.iter().map(Self::streams).collect();
         let hidden: Vec<f32> = futures.iter().flat_map(|f| &f.hidden).copied().collect();
-        let drawn = engine.decide(&hidden, &streams.concat(), sampling.draw(), room);
+        let reach: Vec<Reach> = futures.iter().flat_map(Self::reach).collect();
+        let drawn = (&streams.concat()[..], &reach[..]);
+        let drawn = engine.decide(&hidden, drawn, sampling.draw(), room);
         let mut drawn = &drawn[..];
         for (i, (future, streams)) in futures.iter_mut().zip(&streams).enumerate() {
             let (own, rest) = drawn.split_at(streams.len());
@@ -599,7 +601,8 @@ impl Future {
         room: &mut Workspace,
     ) -> Vec<Pose> {
         let streams = self.streams();
-        let drawn = engine.decide(&self.hidden, &streams, sampling.draw(), room);
+        let reach: Vec<Reach> = self.reach().collect();
+        let drawn = engine.decide(&self.hidden, (&streams, &reach), sampling.draw(), room);
         self.moves(engine, sampling, (&streams, &drawn), ego, room)
     }
 
@@ -608,6 +611,11 @@ impl Future {
         let seed = self.seed.fork(self.frames as u64);
         let stream = |member: &Member| seed.fork(member.agent.id.0 as u64);
         self.members.iter().map(stream).collect()
+    }
+
+    /// How far every agent may come in the next half second.
+    fn reach(&self) -> impl Iterator<Item = Reach> + '_ {
+        self.members.iter().map(|member| Reach::of(&member.now()))
     }
 
     /// Advances by these moves, which the network has not read yet; a driven ego takes the given
@@ -800,7 +808,8 @@ impl Future {
             let rows: Vec<f32> = rows.copied().collect();
             let fresh = |&i: &usize| streams[i].fork(REDRAW + attempt as u64);
             let streams: Vec<Seed> = who.iter().map(fresh).collect();
-            let drawn = engine.decide(&rows, &streams, draw, room);
+            let reach: Vec<Reach> = who.iter().map(|&i| Reach::of(&agents[i])).collect();
+            let drawn = engine.decide(&rows, (&streams, &reach), draw, room);
             who.iter()
                 .zip(drawn)
                 .map(|(&i, bins)| kept(i, bins))
@@ -908,12 +917,13 @@ impl Future {
         let draw = sampling.draw();
         let mut room = Workspace::default();
         let seed = self.seed.fork(self.frames as u64);
+        let reach: Vec<Reach> = self.reach().collect();
         let draws: Vec<_> = draws
             .map(|k| {
                 let stream =
                     |member: &Member| seed.fork(member.agent.id.0 as u64).fork(SAMPLE_STREAMS + k);
                 let streams: Vec<Seed> = self.members.iter().map(stream).collect();
-                engine.decide(&self.hidden, &streams, draw, &mut room)
+                engine.decide(&self.hidden, (&streams, &reach), draw, &mut room)
             })
             .collect();
         let members = self.members.iter().enumerate();

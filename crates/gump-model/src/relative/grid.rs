@@ -73,7 +73,8 @@ pub fn dequantize(bins: [u16; FIELDS]) -> Pose {
     }
 }
 
-fn quantize_ahead(x: f64) -> u16 {
+/// The bin of a distance ahead, metres; the first or last one beyond the grid.
+pub fn quantize_ahead(x: f64) -> u16 {
     let bin = (x / AHEAD_STEP_M + BEHIND).round();
     bin.clamp(0.0, (AHEAD - 1) as f64) as u16
 }

@@ -16,7 +16,7 @@
 //! are drawn again (`faults`, `right_of_way`, `pace`), and those into a junction that is occupied.
 
 use gump_engine::relative::approach::before_line;
-use gump_engine::relative::engine::{Draw, RelativeEngine, Workspace};
+use gump_engine::relative::engine::{Draw, Reach, RelativeEngine, Workspace};
 use gump_engine::relative::keep_clear::closed_entry;
 use gump_engine::relative::right_of_way::{Course, courses, yielding_speed};
 use gump_engine::relative::rules::{kinematically_limited, resolve};
@@ -436,7 +436,7 @@ impl TrackDriver for NetworkDriver {
                 }
                 continue;
             }
-            let moves = self.draws(&hidden, here.len(), seed, &mut room);
+            let moves = self.draws(&hidden, &agents, seed, &mut room);
             for (i, &a) in here.iter().enumerate() {
                 let wanted = tracks[a].way_back(t, &agents[i], self.config.returns);
                 let (Some(wanted), Some(next)) = (wanted, tracks[a].states[t + 1]) else {
@@ -494,7 +494,8 @@ impl NetworkDriver {
                 .collect();
             let of_draw = seed.fork(attempt as u64);
             let streams: Vec<Seed> = who.iter().map(|&i| of_draw.fork(i as u64)).collect();
-            let bins = self.engine.decide(&rows, &streams, draw, room);
+            let reach: Vec<Reach> = who.iter().map(|&i| Reach::of(&agents[i])).collect();
+            let bins = self.engine.decide(&rows, (&streams, &reach), draw, room);
             let drawn = who.iter().zip(bins);
             drawn
                 .map(|(&i, bins)| given[i].unwrap_or_else(|| dequantize(bins)))
@@ -569,7 +570,15 @@ impl NetworkDriver {
     }
 
     /// The candidates' moves of all agents, in the agents' frames.
-    fn draws(&self, hidden: &[f32], n: usize, seed: Seed, room: &mut Workspace) -> Vec<Vec<Pose>> {
+    fn draws(
+        &self,
+        hidden: &[f32],
+        agents: &[Shown],
+        seed: Seed,
+        room: &mut Workspace,
+    ) -> Vec<Vec<Pose>> {
+        let n = agents.len();
+        let reach: Vec<Reach> = agents.iter().map(Reach::of).collect();
         let draw = Draw {
             temperature: self.config.temperature,
             top_p: 1.0,
@@ -577,7 +586,7 @@ impl NetworkDriver {
         let candidates = (0..self.config.candidates).map(|k| {
             let of_draw = seed.fork(k as u64);
             let streams: Vec<Seed> = (0..n).map(|i| of_draw.fork(i as u64)).collect();
-            let bins = self.engine.decide(hidden, &streams, draw, room);
+            let bins = self.engine.decide(hidden, (&streams, &reach), draw, room);
             bins.into_iter().map(dequantize).collect()
         });
         candidates.collect()
