@@ -48,7 +48,7 @@ pub(crate) fn draw_plan(family: RoadFamily, extent: f64, winding: Winding, rng: 
         RoadFamily::Roundabout => roundabout(extent, winding, rng),
         RoadFamily::Arterial => arterial(extent, winding, rng),
         RoadFamily::CurvedRoad => curved_road(extent, winding, rng),
-        RoadFamily::OnRamp => on_ramp(extent, rng),
+        RoadFamily::OnRamp => on_ramp(extent, winding, rng),
         RoadFamily::MidBlockCrosswalk => mid_block(extent, winding, rng),
         RoadFamily::Grid => grid(extent, winding, rng),
     }
@@ -226,7 +226,7 @@ fn mid_block(extent: f64, winding: Winding, rng: &mut Rng) -> Plan {
     }
 }
 
-fn on_ramp(extent: f64, rng: &mut Rng) -> Plan {
+fn on_ramp(extent: f64, winding: Winding, rng: &mut Rng) -> Plan {
     let n = rng.random_range(2..=3);
     let freeway = RoadPlan {
         forward: n,
@@ -240,7 +240,7 @@ fn on_ramp(extent: f64, rng: &mut Rng) -> Plan {
         ..street(n, true, rng)
     };
     let (reach, beside) = (extent * 1.7, rng.random_range(120.0..150.0));
-    let curve = rng.random_range(-0.15..0.15);
+    let curve = winding.bend(0.15, rng);
     let whole = bend(
         Pose::new(-reach, 0.0, 0.0),
         2.0 * reach,
