@@ -75,8 +75,9 @@ const BICYCLE_ASIDE: f64 = 1.35;
 /// From this limit on a lane of a scene like a recorded one is fully used, m/s. Fitted by hand:
 /// recorded traffic drives faster than a plain draw of lanes.
 const FAST_LANE: f64 = 16.0;
-/// A lane of a freeway is one of a ramp if others have a limit this many times as high; so much less it is
-/// used. Fitted by hand: vehicles here stop before they merge, and hold the freeway up (result 51).
+/// A lane of a freeway belongs to a ramp if another lane has a limit this many times as high; its use is
+/// multiplied by the second number. Fitted by hand: vehicles here stop before they merge, and hold the
+/// freeway up (result 51).
 const RAMP: f64 = 1.1;
 const ON_RAMPS: f64 = 0.06;
 

@@ -34,13 +34,13 @@ const SWAY: f64 = 0.14;
 const CATCH_UP: f64 = 0.8;
 const HASTE: f64 = 1.5;
 
-/// Shares of those that reach a crosswalk that cross there, if they have to wait for a light or a vehicle and
-/// if not.
-/// Chosen by hand.
+/// Shares of those that reach a crosswalk that cross there, if they have to wait for a light or a vehicle
+/// and if not. Chosen by hand.
 const CROSSES: [f64; 2] = [0.1, 0.97];
 
-/// How often people pause on sidewalks, per second, and for how long, seconds: of all 424 pedestrians of
-/// `datasets/benchmarks/recorded.toml#train` 2.4 % stand and walk on within nine seconds.
+/// How often people pause on sidewalks, per second, and for how long, seconds: of 424 pedestrians of
+/// `datasets/benchmarks/recorded.toml#train` 2.4 % stand and walk on within nine seconds, and people here do
+/// so at curbs as well.
 const PAUSES: f64 = 1.0 / 500.0;
 const PAUSE_S: std::ops::Range<f64> = 1.5..6.0;
 
