@@ -26,7 +26,7 @@ const STRAYS_M: f64 = 0.3;
 /// it, m/s², down to this speed, metres per second.
 const DECIDES_M: f64 = 16.0;
 const BRAKES_MPS2: f64 = 3.0;
-const TURNS_AT_MPS: f64 = 4.5;
+const TURNS_AT_MPS: f64 = 6.0;
 /// Longer vehicles do not turn in, metres.
 const LONGEST_M: f64 = 7.0;
 /// Its front leaves the street so far before its centre, metres, and a little earlier.

@@ -279,7 +279,15 @@ impl RelativeWorld {
             seed,
             ..first.clone()
         });
-        Ok(futures.collect())
+        let mut futures: Vec<Future> = futures.collect();
+        // Who turns into a driveway now was read as one who does not. An ego may be driven from outside.
+        let mut room = Workspace::default();
+        for future in &mut futures {
+            if future.turn_into_driveways(Some(scene.ego)) {
+                future.reread(&self.engine, &mut room);
+            }
+        }
+        Ok(futures)
     }
 }
 
@@ -332,7 +340,7 @@ pub(super) struct Scene {
     pub memory: MapMemory,
     /// The edges of the road, where rules look at them.
     pub lane_map: LaneMap,
-    /// The ways into driveways, under the rules.
+    /// The ways into driveways.
     driveways: Driveways,
     ego: AgentId,
     /// The lights that it may show.
@@ -365,9 +373,13 @@ impl Scene {
             0 => LaneMap::default(),
             _ => LaneMap::of_curbs(&source, &centres, MAP_M),
         };
-        let driveways = match sampling.redraws > 0 && sampling.routes != Routes::Never {
-            true => Driveways::around(&source, &lane_map, &centres, MAP_M),
-            false => Driveways::default(),
+        let driveways = match sampling.routes {
+            Routes::Never => Driveways::default(),
+            _ if sampling.redraws > 0 => Driveways::around(&source, &lane_map, &centres, MAP_M),
+            _ => {
+                let curbs = LaneMap::of_curbs(&source, &centres, MAP_M);
+                Driveways::around(&source, &curbs, &centres, MAP_M)
+            }
         };
         map.add_driveways(&driveways, &centres, MAP_M);
         Self {
@@ -638,9 +650,7 @@ impl Future {
             Routes::Late => self.is_late(),
             Routes::Always => true,
         };
-        if self.scene.routes != Routes::Never {
-            self.turn_into_driveways(ego.map(|_| id));
-        }
+        self.turn_into_driveways(ego.map(|_| id));
         if has_routes {
             self.choose_ways(ego.map(|_| id));
         }
@@ -655,14 +665,16 @@ impl Future {
         self.limit_waiting(engine, ego.map(|_| id));
     }
 
-    /// Lets vehicles turn into driveways, under the rules.
-    fn turn_into_driveways(&mut self, driven: Option<AgentId>) {
+    /// Lets vehicles turn into driveways, but one that is driven from outside. Returns whether one has
+    /// decided to, or no longer does.
+    fn turn_into_driveways(&mut self, driven: Option<AgentId>) -> bool {
         let driveways = &self.scene.driveways;
         let takes_one = |member: &Member| member.intent.turns_in().is_some();
         // Who takes one of the last layout gives it up.
         if driveways.ways.is_empty() && !self.members.iter().any(takes_one) {
-            return;
+            return false;
         }
+        let mut has_changed = false;
         let seed = self.seed.fork(ROUTES);
         let agents: Vec<Agent> = self.members.iter().map(|member| member.agent).collect();
         let members = self.members.iter_mut();
@@ -673,8 +685,10 @@ impl Future {
             let (now, stream) = (member.now(), seed.fork(id.0 as u64));
             if member.intent.turn_in(driveways, &now, stream, &others) {
                 member.seen.head_for(member.intent.route().cloned());
+                has_changed = true;
             }
         }
+        has_changed
     }
 
     /// Lets vehicles keep to their routes, and gives one to those without; a driven ego has its own.
