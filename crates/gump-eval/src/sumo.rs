@@ -11,7 +11,7 @@ use gump_data::ReadOptions;
 use gump_data::sumo::{CutOptions, Demand, Network, Roads, open_on};
 use gump_metrics::overlapping;
 use gump_scene::{Agent, AgentKind, Scenario, Seed};
-use gump_synthesis::{SumoDemand, draw_sumo_demand, smooth_motion};
+use gump_synthesis::{SumoDemand, draw_sumo_demand, smooth_motion, steer};
 use rand::Rng as _;
 
 use crate::{EvalError, SumoError};
@@ -228,6 +228,9 @@ impl Sumo {
         for record in open_on(&cars, Arc::clone(&place.roads), cut, ReadOptions::ALL)? {
             let mut scene = record?.scenario;
             smooth_motion(&mut scene);
+            if demand.steered {
+                steer(&mut scene);
+            }
             if is_odd(&scene) {
                 continue;
             }

@@ -27,6 +27,9 @@ pub struct SynthesisConfig {
     pub bicycles: RangeInclusive<usize>,
     /// The kind of road; `None` draws one of [`RoadFamily::ALL`] per scene.
     pub family: Option<RoadFamily>,
+    /// Whether vehicles have the headings of bodies that are steered at the front ([`crate::steer`]), or
+    /// head along the paths of their centres.
+    pub steered: bool,
 }
 
 impl SynthesisConfig {
@@ -44,13 +47,14 @@ impl SynthesisConfig {
             pedestrians: 0..=14,
             bicycles: 0..=5,
             family: None,
+            steered: true,
         }
     }
 
     /// The configuration of a version of the generator, field by field: it does not change when
     /// [`Self::standard`] does. `None` for a version that does not exist.
     pub fn of_version(version: u32) -> Option<Self> {
-        (version == 1).then_some(Self {
+        (1..=2).contains(&version).then_some(Self {
             history_s: 1.0,
             future_s: 8.0,
             dt: 0.1,
@@ -61,6 +65,7 @@ impl SynthesisConfig {
             pedestrians: 0..=14,
             bicycles: 0..=5,
             family: None,
+            steered: version > 1,
         })
     }
 

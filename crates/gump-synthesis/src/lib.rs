@@ -27,6 +27,7 @@ mod record;
 mod recorded;
 mod scenario;
 mod smooth;
+mod steering;
 mod sumo_demand;
 mod tracker;
 mod traffic;
@@ -36,12 +37,13 @@ mod traffic;
 /// Frozen sets of scenes name the version that generated them; [`SynthesisConfig::of_version`] and
 /// [`SumoDemand::of_version`] return the configuration of a version. `tests/frozen.rs` checks that
 /// every version still generates its original scenes.
-pub const GENERATOR_VERSION: u32 = 1;
+pub const GENERATOR_VERSION: u32 = 2;
 
 pub use config::SynthesisConfig;
 pub use family::RoadFamily;
 pub use profile::Profile;
 pub use scenario::{synthesize, synthesize_many, try_synthesize};
 pub use smooth::smooth_motion;
+pub use steering::steer;
 pub use sumo_demand::{SumoDemand, draw_sumo_demand};
 pub use tracker::{Tracker, track};

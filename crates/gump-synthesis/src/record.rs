@@ -7,6 +7,7 @@ use gump_scene::{Agent, AgentId, AgentKind, AgentState, LightState};
 
 use crate::map::Placement;
 use crate::network::LaneIdx;
+use crate::steering::{draw_along, round_off};
 use crate::traffic::{Body, TrafficSimulation};
 
 /// Snapshots of traffic; one more before the first frame and after the last, for velocities.
@@ -66,6 +67,22 @@ impl Recording {
     /// Number of snapshots.
     pub(crate) fn n_snapshots(&self) -> usize {
         self.n_frames + 2
+    }
+
+    /// Gives vehicles the ways and the headings of bodies that are steered at the front, gradually.
+    pub(crate) fn steer(&mut self) {
+        let tracks = self.tracks.values_mut();
+        for track in tracks.filter(|track| track.body.kind == AgentKind::Vehicle) {
+            let length = track.body.size[0];
+            for stretch in track.poses.chunk_by_mut(|a, b| a.is_some() == b.is_some()) {
+                let mut poses: Vec<Pose> = stretch.iter().copied().flatten().collect();
+                round_off(&mut poses);
+                draw_along(&mut poses, length);
+                for (pose, turned) in stretch.iter_mut().zip(poses) {
+                    *pose = Some(turned);
+                }
+            }
+        }
     }
 
     /// Moves a standing body through these poses, one per snapshot.

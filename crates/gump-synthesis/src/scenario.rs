@@ -12,6 +12,7 @@ use crate::layout::{Winding, draw_plan};
 use crate::map::{Placement, build_map, lane_id};
 use crate::network::{LaneIdx, Network};
 use crate::record::{Recording, Track};
+use crate::steering::steer;
 use crate::traffic::{Demand, Scenery, TrafficSimulation};
 use crate::{RoadFamily, SynthesisConfig};
 
@@ -90,6 +91,9 @@ fn draw_scenario(
         objects_of_interest: Vec::new(),
         tags: Vec::new(),
     };
+    if config.steered {
+        steer(&mut scenario);
+    }
     scenario.tags = gump_metrics::tags::extract_tags(&scenario);
     Some(scenario)
 }

@@ -25,6 +25,9 @@ pub struct SumoDemand {
     pub people: f64,
     /// Multiplies all numbers.
     pub density: f64,
+    /// Whether vehicles have the headings of bodies that are steered at the front ([`crate::steer`]), or
+    /// those of SUMO.
+    pub steered: bool,
 }
 
 impl SumoDemand {
@@ -37,19 +40,21 @@ impl SumoDemand {
             bicycles: 0.08,
             people: 0.45,
             density: 1.0,
+            steered: true,
         }
     }
 
     /// The configuration of a version of the generator, field by field: it does not change when
     /// [`Self::standard`] does. `None` for a version that does not exist.
     pub fn of_version(version: u32) -> Option<Self> {
-        (version == 1).then_some(Self {
+        (1..=2).contains(&version).then_some(Self {
             until_s: 150.0,
             radius_m: 450.0,
             vehicles: 50..=220,
             bicycles: 0.08,
             people: 0.45,
             density: 1.0,
+            steered: version > 1,
         })
     }
 }

@@ -7,7 +7,8 @@
 use std::path::Path;
 
 use gump_data::sumo::Network;
-use gump_scene::{Scenario, Seed};
+use gump_geometry::angle_difference;
+use gump_scene::{Agent, AgentKind, Scenario, Seed};
 use gump_synthesis::{
     GENERATOR_VERSION, RoadFamily, SumoDemand, SynthesisConfig, draw_sumo_demand, synthesize,
 };
@@ -66,6 +67,32 @@ fn version_1_makes_the_scenes_it_always_made() {
         sum.scene(&synthesize(&config, Seed(41).fork(k)));
     }
     assert_eq!(format!("{:016x}", sum.0), "5387d87bc366abaa");
+}
+
+#[test]
+fn version_2_differs_by_the_headings_of_vehicles_alone() {
+    let mut turned = 0;
+    for (k, family) in (0_u64..).zip(RoadFamily::ALL) {
+        let [before, now] = [1, 2].map(|version| {
+            let config = SynthesisConfig {
+                family: Some(family),
+                ..SynthesisConfig::of_version(version).unwrap()
+            };
+            synthesize(&config, Seed(41).fork(k))
+        });
+        let agents = |scene: &Scenario| -> Vec<Agent> {
+            let frames = scene.log.iter();
+            frames.flat_map(|frame| frame.agents().to_vec()).collect()
+        };
+        for (a, b) in agents(&before).into_iter().zip(agents(&now)) {
+            assert_eq!(a.state.pose.position, b.state.pose.position);
+            assert_eq!(a.state.velocity, b.state.velocity);
+            let by = angle_difference(a.state.pose.heading, b.state.pose.heading).abs();
+            assert!(by == 0.0 || a.kind == AgentKind::Vehicle);
+            turned += usize::from(by > 0.03);
+        }
+    }
+    assert!(turned > 500, "{turned}");
 }
 
 #[test]

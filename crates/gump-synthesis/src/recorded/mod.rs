@@ -117,6 +117,9 @@ pub(crate) fn draw_scenario(
         traffic.step();
     }
     let mut recording = Recording::make(&mut traffic, config.n_frames());
+    if config.steered {
+        recording.steer();
+    }
     if !recording.part_bodies() {
         return None;
     }

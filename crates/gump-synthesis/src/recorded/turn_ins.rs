@@ -17,6 +17,7 @@ use super::manoeuvres::{is_clear, is_off_road};
 use crate::curve::{Track, connect, line};
 use crate::network::Network;
 use crate::record::Recording;
+use crate::steering::draw_along;
 
 // Numbers are chosen by hand, so that as many vehicles with a driveway ahead turn in as in recordings: of
 // 154 of `datasets/benchmarks/recorded.toml#train` on a lane, at 0.5 to 10 m/s and with a driveway within
@@ -94,9 +95,10 @@ pub(crate) fn add(
             .collect();
         passed.shuffle(rng);
         for driveway in passed.into_iter().take(TRIED) {
-            let Some((poses, end, room)) = way_in(&recorded, driveway, dt, rng) else {
+            let Some((mut poses, end, room)) = way_in(&recorded, driveway, dt, rng) else {
                 continue;
             };
+            draw_along(&mut poses, body.size[0]);
             let poses: Vec<Option<Pose>> = poses.into_iter().map(Some).collect();
             let size = [body.size[0], body.size[1]];
             if is_off_road(network, end, OFF_ROAD_M)
