@@ -7,8 +7,13 @@ use gump_scene::{Agent, AgentId, AgentKind, AgentState, LightState};
 
 use crate::map::Placement;
 use crate::network::LaneIdx;
+use crate::smooth::smooth_poses;
 use crate::steering::{draw_along, round_off};
 use crate::traffic::{Body, TrafficSimulation};
+
+/// Standard deviation of the average over time by which people turn gradually, seconds: with it the
+/// directions of their steps change about as those of recorded people do.
+const PEOPLE_S: f64 = 0.5;
 
 /// Snapshots of traffic; one more before the first frame and after the last, for velocities.
 #[derive(Debug)]
@@ -80,6 +85,20 @@ impl Recording {
                 draw_along(&mut poses, length);
                 for (pose, turned) in stretch.iter_mut().zip(poses) {
                     *pose = Some(turned);
+                }
+            }
+        }
+    }
+
+    /// Lets people turn, and begin and stop to walk, gradually.
+    pub(crate) fn ease_people(&mut self, dt: f64) {
+        let tracks = self.tracks.values_mut();
+        for track in tracks.filter(|track| track.body.kind == AgentKind::Pedestrian) {
+            for stretch in track.poses.chunk_by_mut(|a, b| a.is_some() == b.is_some()) {
+                let mut poses: Vec<Pose> = stretch.iter().copied().flatten().collect();
+                smooth_poses(&mut poses, PEOPLE_S / dt);
+                for (pose, eased) in stretch.iter_mut().zip(poses) {
+                    *pose = Some(eased);
                 }
             }
         }

@@ -5,7 +5,7 @@
 
 use std::collections::BTreeMap;
 
-use gump_geometry::{DVec2, angle_difference, wrap_angle};
+use gump_geometry::{DVec2, Pose, angle_difference, wrap_angle};
 use gump_scene::{Agent, AgentId, AgentKind, Frame, Scenario};
 
 /// Standard deviation of the average over time, seconds: vehicles steer over about a second.
@@ -48,30 +48,37 @@ pub fn smooth_motion(scenario: &mut Scenario) {
 
 /// Smooths one stretch of a track.
 fn smooth(agents: &mut [Agent], dt: f64) {
-    let positions: Vec<DVec2> = agents
-        .iter()
-        .map(|agent| agent.state.pose.position)
-        .collect();
-    let mut heading = agents[0].state.pose.heading;
-    let headings: Vec<f64> = agents
-        .iter()
-        .map(|agent| {
-            heading += angle_difference(agent.state.pose.heading, heading);
-            heading
-        })
-        .collect();
-    let sigma = SIGMA_S / dt;
-    let positions = average(&positions, sigma);
-    let headings = average(&headings, sigma);
+    let mut poses: Vec<Pose> = agents.iter().map(|agent| agent.state.pose).collect();
+    smooth_poses(&mut poses, SIGMA_S / dt);
     let last = agents.len() - 1;
     for (i, agent) in agents.iter_mut().enumerate() {
         let (before, after) = (i.saturating_sub(1), (i + 1).min(last));
         if before < after {
             let span = (after - before) as f64 * dt;
-            agent.state.velocity = (positions[after] - positions[before]) / span;
+            agent.state.velocity = (poses[after].position - poses[before].position) / span;
         }
-        agent.state.pose.position = positions[i];
-        agent.state.pose.heading = wrap_angle(headings[i]);
+        agent.state.pose = poses[i];
+    }
+}
+
+/// Averages the poses of one agent over `sigma` steps.
+pub(crate) fn smooth_poses(poses: &mut [Pose], sigma: f64) {
+    let Some(first) = poses.first() else {
+        return;
+    };
+    let mut heading = first.heading;
+    let unwrapped = poses.iter().map(|pose| {
+        heading += angle_difference(pose.heading, heading);
+        heading
+    });
+    let headings = average(&unwrapped.collect::<Vec<f64>>(), sigma);
+    let positions: Vec<DVec2> = poses.iter().map(|pose| pose.position).collect();
+    let positions = average(&positions, sigma);
+    for ((pose, position), heading) in poses.iter_mut().zip(positions).zip(headings) {
+        *pose = Pose {
+            position,
+            heading: wrap_angle(heading),
+        };
     }
 }
 

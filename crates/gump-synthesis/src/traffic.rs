@@ -14,6 +14,7 @@ mod people;
 mod right_of_way;
 mod size;
 mod vehicle;
+mod wait_inside;
 
 pub(crate) use crosser::{Jaywalk, Span};
 pub(crate) use demand::{Demand, Scenery, Standing};

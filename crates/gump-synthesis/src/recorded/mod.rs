@@ -134,6 +134,10 @@ pub(crate) fn draw_scenario(
     );
     walkers::add(&mut recording, &network, config.dt, &mut parking_rng);
     walkers::shift(&mut recording, config.dt, &mut parking_rng);
+    recording.ease_people(config.dt);
+    if !recording.part_bodies() {
+        return None;
+    }
     let ego = choose_ego(&recording, config.now(), &mut rng)?;
     let placement = draw_placement(&mut rng);
     let mut route = route(&network, ego, &traffic, &placement);

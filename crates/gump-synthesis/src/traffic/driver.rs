@@ -59,6 +59,8 @@ pub(crate) struct DriverParameters {
     /// Seconds to spare with which the driver passes before people who are still on their way to
     /// the vehicle's path; without a number people always go first.
     pub(crate) before_people: Option<f64>,
+    /// Enters a junction to wait there for oncoming traffic or people before it turns.
+    pub(crate) waits_inside: bool,
     /// Seconds to spare with which the driver enters a junction behind those who are still on their
     /// way out of the own path; without a number, when they are out of it.
     pub(crate) behind_others: Option<f64>,
@@ -93,6 +95,7 @@ impl DriverParameters {
             bump_speed: 5.0,
             before_people: None,
             behind_others: None,
+            waits_inside: false,
             clearance: 0.9,
             wander: 0.17,
             unrest: 1.0,
@@ -132,6 +135,7 @@ impl DriverParameters {
             wander: around(0.08, 0.0, 0.05),
             unrest: around(1.3, 0.4, 0.5).max(0.5),
             is_polite: true,
+            waits_inside: true,
         };
         // Half of the recorded drivers stay above 0.5 m/s at stop lines, and most of the others stand
         // for less than two seconds.
@@ -156,6 +160,7 @@ impl DriverParameters {
             },
             rolling_stop,
             pause,
+            waits_inside: rng.random_bool(0.85),
             ..driver
         }
     }

@@ -10,7 +10,8 @@ use gump_scene::LightState;
 use super::TrafficSimulation;
 use super::people::Activity;
 use super::vehicle::Vehicle;
-use crate::network::{Connector, LaneIdx};
+use super::wait_inside::Wait;
+use crate::network::{Conflict, Connector, Crossing, LaneIdx};
 use crate::plan::Control;
 
 // Clearances and the thresholds below are chosen by hand; tests check that boxes seldom overlap.
@@ -32,6 +33,7 @@ impl TrafficSimulation<'_> {
             self.end_claims(i);
             self.note_waiting(i);
         }
+        self.end_waits();
         let mut order: Vec<(u8, f64, usize, usize)> = Vec::new();
         for (i, vehicle) in self.vehicles.iter().enumerate() {
             let Some(leg) = vehicle.next_connector(self.network) else {
@@ -46,17 +48,27 @@ impl TrafficSimulation<'_> {
         }
         order.sort_by(|a, b| b.0.cmp(&a.0).then(a.1.total_cmp(&b.1)).then(a.2.cmp(&b.2)));
         for (_, distance, i, leg) in order {
-            if self.may_claim(i, leg, distance) {
-                let lane = self.vehicles[i].path[leg];
-                self.vehicles[i].claims.push(lane);
-                self.vehicles[i].waiting_since = None;
-            }
+            let wait = match self.may_claim(i, leg, distance) {
+                true => None,
+                false => match self.place_to_wait(i, leg, distance) {
+                    None => continue,
+                    place => place,
+                },
+            };
+            let lane = self.vehicles[i].path[leg];
+            self.vehicles[i].claims.push(lane);
+            self.vehicles[i].wait = wait;
+            self.vehicles[i].waiting_since = None;
         }
     }
 
     /// Metres from the front to the line where vehicle `i` has to stop, if it has to.
     pub(super) fn distance_to_stop(&self, i: usize) -> Option<f64> {
         let vehicle = &self.vehicles[i];
+        if let Some(wait) = vehicle.wait {
+            let leg = vehicle.path.iter().position(|lane| *lane == wait.lane)?;
+            return Some(vehicle.distance_to(self.network, leg) + wait.until);
+        }
         let leg = vehicle.next_connector(self.network)?;
         if vehicle.claims.contains(&vehicle.path[leg]) {
             return None;
@@ -80,7 +92,7 @@ impl TrafficSimulation<'_> {
         (distance < self.decision_distance(vehicle)).then_some(distance)
     }
 
-    fn connector(&self, lane: LaneIdx) -> &Connector {
+    pub(super) fn connector(&self, lane: LaneIdx) -> &Connector {
         self.network.lanes[lane]
             .connector
             .as_ref()
@@ -116,7 +128,7 @@ impl TrafficSimulation<'_> {
         self.vehicles[i].claims = claims;
     }
 
-    fn can_stop(&self, vehicle: &Vehicle, distance: f64) -> bool {
+    pub(super) fn can_stop(&self, vehicle: &Vehicle, distance: f64) -> bool {
         // Brakes do not bite at once.
         let left = distance - 0.3 - 0.3 * vehicle.speed;
         vehicle.speed * vehicle.speed < 2.0 * vehicle.driver.yellow_braking * left.max(0.01)
@@ -136,7 +148,7 @@ impl TrafficSimulation<'_> {
         }
     }
 
-    fn light(&self, connector: &Connector, time: f64) -> LightState {
+    pub(super) fn light(&self, connector: &Connector, time: f64) -> LightState {
         let cycle = self.network.junctions[connector.junction].cycle.as_ref();
         match (cycle, connector.signal) {
             (Some(cycle), Some(group)) => cycle.state(group, time),
@@ -160,22 +172,47 @@ impl TrafficSimulation<'_> {
             LightState::Yellow => !self.can_stop(vehicle, distance),
             LightState::Red | LightState::Unknown => false,
         };
-        let stopped = match (connector.must_stop, vehicle.waiting_since) {
-            (true, Some(since)) => self.time - since > vehicle.driver.pause,
-            (true, None) => false,
-            (false, _) => true,
-        };
-        goes && stopped
+        goes && self.has_stopped(vehicle, connector)
             && self.is_first_in_line(vehicle, leg)
-            && self.is_unclaimed(i, lane, connector, distance)
-            && self.has_priority(i, lane, connector, distance)
-            && self.is_free_of_people(vehicle, connector, distance)
+            && self.nobody_waits_on(vehicle, lane)
+            && self.has_way(i, lane, connector, distance)
             && self.has_room_beyond(i, leg)
             && self.has_room_in_ring(i, leg)
     }
 
+    /// True if it has stopped at its line, or need not.
+    pub(super) fn has_stopped(&self, vehicle: &Vehicle, connector: &Connector) -> bool {
+        match (connector.must_stop, vehicle.waiting_since) {
+            (true, Some(since)) => self.time - since > vehicle.driver.pause,
+            (true, None) => false,
+            (false, _) => true,
+        }
+    }
+
+    /// True if neither vehicles nor people are in the way on a connector, or go first there.
+    pub(super) fn has_way(
+        &self,
+        i: usize,
+        lane: LaneIdx,
+        connector: &Connector,
+        distance: f64,
+    ) -> bool {
+        self.is_unclaimed(i, lane, connector, distance)
+            && self.has_priority(i, lane, connector, distance)
+            && self.is_free_of_people(&self.vehicles[i], connector, distance)
+    }
+
+    /// True unless another vehicle from the same lane waits within the junction.
+    pub(super) fn nobody_waits_on(&self, vehicle: &Vehicle, lane: LaneIdx) -> bool {
+        let lanes = &self.network.lanes;
+        self.vehicles.iter().all(|other| {
+            let waits = |wait: Wait| lanes[wait.lane].predecessors == lanes[lane].predecessors;
+            other.id == vehicle.id || !other.wait.is_some_and(waits)
+        })
+    }
+
     /// True unless entering a roundabout that is as full as can still flow.
-    fn has_room_in_ring(&self, i: usize, leg: usize) -> bool {
+    pub(super) fn has_room_in_ring(&self, i: usize, leg: usize) -> bool {
         let lanes = &self.network.lanes;
         let vehicle = &self.vehicles[i];
         let enters = vehicle
@@ -197,7 +234,7 @@ impl TrafficSimulation<'_> {
     }
 
     /// True if all vehicles between the vehicle and the line have decided.
-    fn is_first_in_line(&self, vehicle: &Vehicle, leg: usize) -> bool {
+    pub(super) fn is_first_in_line(&self, vehicle: &Vehicle, leg: usize) -> bool {
         vehicle.path[vehicle.leg..leg]
             .iter()
             .enumerate()
@@ -215,28 +252,34 @@ impl TrafficSimulation<'_> {
 
     /// True if no claim conflicts with this connector.
     fn is_unclaimed(&self, i: usize, lane: LaneIdx, connector: &Connector, distance: f64) -> bool {
+        let conflicts = connector.conflicts.iter();
+        let mut others = conflicts.filter(|conflict| conflict.other != lane);
+        others.all(|conflict| !self.is_taken(i, conflict, distance))
+    }
+
+    /// True if another vehicle has claimed what vehicle `i` would share with it, and is not out of it in time.
+    pub(super) fn is_taken(&self, i: usize, conflict: &Conflict, distance: f64) -> bool {
         let vehicle = &self.vehicles[i];
-        let clear = |(j, other): (usize, &Vehicle)| {
-            j == i
-                || other.claims.iter().all(|&claimed| {
-                    let conflict = connector.conflicts.iter().find(|c| c.other == claimed);
-                    let Some(conflict) = conflict.filter(|_| claimed != lane) else {
-                        return true;
-                    };
-                    let Some(rear) = other.rear_on(self.network, claimed) else {
-                        return true;
-                    };
-                    let left = conflict.theirs.1 - rear;
-                    let leaves = |spare: f64| {
-                        let out = left / other.speed;
-                        let sure = other.speed > SURE && other.acceleration > -0.5;
-                        let way = distance + conflict.mine.0;
-                        sure && out + spare < vehicle.soonest(way)
-                    };
-                    left < 0.0 || vehicle.driver.behind_others.is_some_and(leaves)
-                })
+        let takes = |other: &Vehicle| {
+            let Some(rear) = other.rear_on(self.network, conflict.other) else {
+                return false;
+            };
+            let waits = |wait: Wait| wait.lane == conflict.other && wait.until < conflict.theirs.0;
+            if other.wait.is_some_and(waits) {
+                return false;
+            }
+            let left = conflict.theirs.1 - rear;
+            let leaves = |spare: f64| {
+                let out = left / other.speed;
+                let sure = other.speed > SURE && other.acceleration > -0.5;
+                let way = distance + conflict.mine.0;
+                sure && out + spare < vehicle.soonest(way)
+            };
+            left >= 0.0 && !vehicle.driver.behind_others.is_some_and(leaves)
         };
-        self.vehicles.iter().enumerate().all(clear)
+        let others = self.vehicles.iter().enumerate().filter(|(j, _)| *j != i);
+        let mut claimants = others.filter(|(_, other)| other.claims.contains(&conflict.other));
+        claimants.any(|(_, other)| takes(other))
     }
 
     /// True if no traffic that goes first comes too soon.
@@ -278,32 +321,41 @@ impl TrafficSimulation<'_> {
 
     /// True if no pedestrian is on the crosswalks on the path, or waits there and is given way.
     fn is_free_of_people(&self, vehicle: &Vehicle, connector: &Connector, distance: f64) -> bool {
-        connector.crossings.iter().all(|crossing| {
-            let signalled = connector.signal.is_some();
-            // Metres that people have to be away for the vehicle to pass before them.
-            let passes = distance + crossing.along.1 + vehicle.length();
-            let passed = passes / (0.5 * vehicle.speed + 4.0);
-            let spare = vehicle.driver.before_people;
-            let before = spare.map_or(f64::INFINITY, |spare| FAST_WALK * (passed + spare));
-            let at = self.people.iter();
-            let mut at =
-                at.flat_map(|person| person.on_crosswalk(self.network, crossing.crosswalk));
-            at.all(|at| match at.activity {
-                Activity::Crosses { forward } => {
-                    let (low, high) = crossing.across;
-                    if forward {
-                        at.last > high + PERSON_CLEARANCE || at.first < low - before
-                    } else {
-                        at.last < low - PERSON_CLEARANCE || at.first > high + before
-                    }
+        let mut crossings = connector.crossings.iter();
+        crossings.all(|crossing| self.is_crossing_free(vehicle, connector, crossing, distance))
+    }
+
+    /// The same for one of them.
+    pub(super) fn is_crossing_free(
+        &self,
+        vehicle: &Vehicle,
+        connector: &Connector,
+        crossing: &Crossing,
+        distance: f64,
+    ) -> bool {
+        let signalled = connector.signal.is_some();
+        // Metres that people have to be away for the vehicle to pass before them.
+        let passes = distance + crossing.along.1 + vehicle.length();
+        let passed = passes / (0.5 * vehicle.speed + 4.0);
+        let spare = vehicle.driver.before_people;
+        let before = spare.map_or(f64::INFINITY, |spare| FAST_WALK * (passed + spare));
+        let at = self.people.iter();
+        let mut at = at.flat_map(|person| person.on_crosswalk(self.network, crossing.crosswalk));
+        at.all(|at| match at.activity {
+            Activity::Crosses { forward } => {
+                let (low, high) = crossing.across;
+                if forward {
+                    at.last > high + PERSON_CLEARANCE || at.first < low - before
+                } else {
+                    at.last < low - PERSON_CLEARANCE || at.first > high + before
                 }
-                Activity::Waits { may_go } => !(may_go && (signalled || vehicle.driver.is_polite)),
-            })
+            }
+            Activity::Waits { may_go } => !(may_go && (signalled || vehicle.driver.is_polite)),
         })
     }
 
     /// True if the vehicle will not have to stop inside the junction.
-    fn has_room_beyond(&self, i: usize, leg: usize) -> bool {
+    pub(super) fn has_room_beyond(&self, i: usize, leg: usize) -> bool {
         let vehicle = &self.vehicles[i];
         let Some(&exit) = vehicle.path.get(leg + 1) else {
             return true;
@@ -336,8 +388,12 @@ impl TrafficSimulation<'_> {
             .passed_by
             .iter()
             .all(|&(lane, place)| {
-                let past = self.connector(lane).crossings[place].along.1;
+                let (begins, past) = self.connector(lane).crossings[place].along;
                 self.vehicles.iter().all(|vehicle| {
+                    let waits = |wait: Wait| wait.lane == lane && wait.until < begins;
+                    if vehicle.wait.is_some_and(waits) {
+                        return true;
+                    }
                     let claimed = vehicle.claims.contains(&lane);
                     let rear = vehicle.rear_on(self.network, lane);
                     let on_it =

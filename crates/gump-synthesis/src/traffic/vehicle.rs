@@ -7,6 +7,7 @@ use rand::Rng as _;
 use super::Body;
 use super::beside::Beside;
 use super::driver::DriverParameters;
+use super::wait_inside::Wait;
 use crate::curve::{smooth_step, smooth_step_slope};
 use crate::network::{LaneIdx, Network};
 
@@ -76,6 +77,8 @@ pub(crate) struct Vehicle {
     noise: f64,
     /// Connectors it may use.
     pub(crate) claims: Vec<LaneIdx>,
+    /// How far it may go into a junction that it may not cross yet.
+    pub(crate) wait: Option<Wait>,
     /// Time at which it came to rest at the line it waits at, seconds.
     pub(crate) waiting_since: Option<f64>,
     pub(crate) change: Option<LaneChange>,
@@ -120,6 +123,7 @@ impl Vehicle {
             beside: Beside::NOTHING,
             noise: 0.0,
             claims: Vec::new(),
+            wait: None,
             waiting_since: None,
             change: None,
             patience: rng.random_range(1.0..12.0),
