@@ -3,7 +3,7 @@
 //! `dress` adds side roads, car parks and parking to a plan, `bumps`, `driveways` and `islands` what
 //! their names say; `scenery` adds parked vehicles, standing pedestrians and crossing ones anywhere on the
 //! network; `manoeuvres`, `turn_ins` and `walkers` add motion in car parks and driveways; `turns` changes how the map shows
-//! turns; this module combines them. Numbers and shares are fitted by hand to
+//! lanes; this module combines them. Numbers and shares are fitted by hand to
 //! `configs/targets/waymo-like.toml` (docs/results/0017-recorded-like.md); distances that no target
 //! measures are chosen by eye.
 
@@ -146,6 +146,7 @@ pub(crate) fn draw_scenario(
     let is_mapped = |lane: &LaneId| !network.unmapped.iter().any(|&i| lane_id(i) == *lane);
     route.lanes.retain(is_mapped);
     turns::widen(&mut network, &mut rng);
+    turns::skew(&mut network, &mut rng);
     network.hides_limits = rng.random_bool(NO_LIMITS);
     if rng.random_bool(NO_SIGNS) {
         network.furniture.stop_signs.clear();

@@ -18,12 +18,13 @@ const LONGEST_M: [f64; 2] = [70.0, 130.0];
 /// Deceleration that a change may impose on the vehicle behind, m/s²: a comfortable one. Chosen by
 /// hand.
 const IMPOSED_BRAKING: f64 = 2.0;
-/// Acceleration that a change must gain, m/s²: in plain scenes, and in those like recorded ones,
-/// which change lanes more often (docs/results/0020-learning-from-realism.md). Chosen by hand.
-const GAIN: [f64; 2] = [0.25, 0.05];
-/// Probability of a lane change without gain when a vehicle considers one: in plain scenes, and in
-/// those like recorded ones, for the same reason. Chosen by hand.
-const WHIM: [f64; 2] = [0.04, 0.7];
+/// Acceleration that a change must gain, m/s²: in plain scenes, and in those like recorded ones, below and
+/// above [`FAST_MPS`]. Chosen by hand: recorded vehicles change lanes more often than plain ones
+/// (docs/results/0020-learning-from-realism.md), but less often where they are fast (result 52).
+const GAIN: [f64; 3] = [0.25, 0.05, 0.25];
+/// Probability of a lane change without gain when a vehicle considers one; as above.
+const WHIM: [f64; 3] = [0.04, 0.7, 0.1];
+const FAST_MPS: f64 = 13.0;
 
 impl TrafficSimulation<'_> {
     /// Starts lane changes and moves over for bicycles.
@@ -40,7 +41,8 @@ impl TrafficSimulation<'_> {
             if !must && lane.left.is_none() && lane.right.is_none() {
                 continue;
             }
-            let whim = !must && self.rng.random_bool(WHIM[self.is_real()]);
+            let whim = WHIM[self.kind_of(vehicle)];
+            let whim = !must && self.rng.random_bool(whim);
             let patience = self.rng.random_range(1.0..3.0);
             let vehicle = &self.vehicles[i];
             let sides = [lane.left, lane.right];
@@ -105,12 +107,18 @@ impl TrafficSimulation<'_> {
         }
         let now = self.occupancy.leader(self.network, vehicle);
         must || whim
-            || then > driver.acceleration(vehicle.speed, speed, now, None) + GAIN[self.is_real()]
+            || then
+                > driver.acceleration(vehicle.speed, speed, now, None) + GAIN[self.kind_of(vehicle)]
     }
 
     /// 1 in scenes like recorded ones, 0 in plain ones.
     fn is_real(&self) -> usize {
         usize::from(self.demand.scenery.is_real)
+    }
+
+    /// 2 for fast vehicles in scenes like recorded ones, 1 for others there, 0 in plain ones.
+    fn kind_of(&self, vehicle: &Vehicle) -> usize {
+        self.is_real() * (1 + usize::from(vehicle.speed > FAST_MPS))
     }
 
     fn change_length(&self, vehicle: &Vehicle, must: bool) -> f64 {
