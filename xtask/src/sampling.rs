@@ -54,7 +54,7 @@ pub(crate) struct Draw {
     /// When the vehicles of a relative network are given routes, which they keep
     #[arg(long, value_name = "WHEN", value_parser = one_of(ROUTES), default_value_t = Routes::Late)]
     routes: Routes,
-    /// The network alone: no rejection sampling, no kinematic limits
+    /// The network alone: no move is drawn again or limited; intents are still drawn (--routes)
     #[arg(long)]
     raw: bool,
     /// The paper's decoding: temperature 1.1, decay 1.2, no rejection or limits; linear

@@ -76,29 +76,28 @@ impl Recording {
 
     /// Gives vehicles the ways and the headings of bodies that are steered at the front, gradually.
     pub(crate) fn steer(&mut self) {
-        let tracks = self.tracks.values_mut();
-        for track in tracks.filter(|track| track.body.kind == AgentKind::Vehicle) {
-            let length = track.body.size[0];
-            for stretch in track.poses.chunk_by_mut(|a, b| a.is_some() == b.is_some()) {
-                let mut poses: Vec<Pose> = stretch.iter().copied().flatten().collect();
-                round_off(&mut poses);
-                draw_along(&mut poses, length);
-                for (pose, turned) in stretch.iter_mut().zip(poses) {
-                    *pose = Some(turned);
-                }
-            }
-        }
+        self.reshape(AgentKind::Vehicle, |body, poses| {
+            round_off(poses);
+            draw_along(poses, body.size[0]);
+        });
     }
 
     /// Lets people turn, and begin and stop to walk, gradually.
     pub(crate) fn ease_people(&mut self, dt: f64) {
+        self.reshape(AgentKind::Pedestrian, |_, poses| {
+            smooth_poses(poses, PEOPLE_S / dt);
+        });
+    }
+
+    /// Changes the poses of all bodies of a kind, each time from when it appears to when it is gone.
+    fn reshape(&mut self, kind: AgentKind, change: impl Fn(&Body, &mut [Pose])) {
         let tracks = self.tracks.values_mut();
-        for track in tracks.filter(|track| track.body.kind == AgentKind::Pedestrian) {
+        for track in tracks.filter(|track| track.body.kind == kind) {
             for stretch in track.poses.chunk_by_mut(|a, b| a.is_some() == b.is_some()) {
                 let mut poses: Vec<Pose> = stretch.iter().copied().flatten().collect();
-                smooth_poses(&mut poses, PEOPLE_S / dt);
-                for (pose, eased) in stretch.iter_mut().zip(poses) {
-                    *pose = Some(eased);
+                change(&track.body, &mut poses);
+                for (pose, changed) in stretch.iter_mut().zip(poses) {
+                    *pose = Some(changed);
                 }
             }
         }

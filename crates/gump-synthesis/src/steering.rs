@@ -12,7 +12,7 @@ use gump_scene::{AgentId, AgentKind, Frame, Scenario};
 /// From the centre of a vehicle to its rear axle, as a share of its length. Measured alike, over half
 /// seconds, the angle between the motion of the centre and the heading is that of 1.15 m for cars 4.67 m
 /// long in recorded turns (`datasets/benchmarks/recorded.toml#train`), and of 1.36 m for those of 5.31 m.
-const REAR_AXLE: f64 = 0.23;
+pub(crate) const REAR_AXLE: f64 = 0.23;
 /// The rear axle is drawn along in steps of this length, metres.
 const STEP_M: f64 = 0.25;
 /// The turn at the beginning is measured over this distance, metres.
@@ -92,10 +92,8 @@ pub(crate) fn round_off(poses: &mut [Pose]) {
     let length = path[path.len() - 1].0;
     let inside = |s: f64| {
         let i = path.partition_point(|(at, _)| *at <= s);
-        let ((from, a), (to, b)) = (
-            path[i.clamp(1, path.len() - 1) - 1],
-            path[i.clamp(1, path.len() - 1)],
-        );
+        let i = i.clamp(1, path.len() - 1);
+        let ((from, a), (to, b)) = (path[i - 1], path[i]);
         a.lerp(b, ((s - from) / (to - from)).clamp(0.0, 1.0))
     };
     // Beyond its ends the path goes on by point reflection, so that a straight line stays one.

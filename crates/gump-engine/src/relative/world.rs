@@ -338,7 +338,7 @@ pub(super) struct Scene {
     centres: Vec<DVec2>,
     map: VectorMap,
     pub memory: MapMemory,
-    /// The edges of the road, where rules look at them.
+    /// The edges of the road, for rules and for ways into driveways.
     pub lane_map: LaneMap,
     /// The ways into driveways.
     driveways: Driveways,
@@ -369,17 +369,13 @@ impl Scene {
         sampling: &RelativeSampling,
     ) -> Self {
         let mut map = VectorMap::around(&source, &centres, MAP_M, Hidden::default());
-        let lane_map = match sampling.redraws {
-            0 => LaneMap::default(),
+        let lane_map = match (sampling.redraws, sampling.routes) {
+            (0, Routes::Never) => LaneMap::default(),
             _ => LaneMap::of_curbs(&source, &centres, MAP_M),
         };
         let driveways = match sampling.routes {
             Routes::Never => Driveways::default(),
-            _ if sampling.redraws > 0 => Driveways::around(&source, &lane_map, &centres, MAP_M),
-            _ => {
-                let curbs = LaneMap::of_curbs(&source, &centres, MAP_M);
-                Driveways::around(&source, &curbs, &centres, MAP_M)
-            }
+            _ => Driveways::around(&source, &lane_map, &centres, MAP_M),
         };
         map.add_driveways(&driveways, &centres, MAP_M);
         Self {

@@ -11,6 +11,7 @@ use rand::Rng as _;
 use crate::network::Network;
 use crate::plan::CAR_PARK_SPEED;
 use crate::record::Recording;
+use crate::steering::REAR_AXLE;
 use crate::traffic::Body;
 
 // Numbers are chosen by hand; no target measures how many vehicles park.
@@ -30,9 +31,6 @@ const ROOM_M: [f64; 2] = [0.15, 0.8];
 /// of the other part, m/s.
 const NEAR_PLACE_MPS: std::ops::Range<f64> = 0.8..2.0;
 const ON_WAY_MPS: std::ops::Range<f64> = 2.0..5.5;
-/// From the middle of a vehicle to its rear axle, as a share of its length: 1.46 m of 5.18 m in
-/// nuPlan's Pacifica.
-const REAR_AXLE: f64 = 0.28;
 /// Tightest turn, 1/m: a radius of 5 m, as passenger cars have.
 const CURVATURE: f64 = 0.2;
 

@@ -135,6 +135,7 @@ pub(crate) fn draw_scenario(
     walkers::add(&mut recording, &network, config.dt, &mut parking_rng);
     walkers::shift(&mut recording, config.dt, &mut parking_rng);
     recording.ease_people(config.dt);
+    // Some that were added stayed clear of where others were before.
     if !recording.part_bodies() {
         return None;
     }

@@ -20,8 +20,8 @@ const OF_LENGTH: f64 = 0.1;
 // Recorded vehicles that drive straight on head 0.0088 rad (median) away from their lane at 5 to 10 m/s and
 // 0.0046 above 16 m/s, and keep that heading: a second and a half later it is hardly correlated with the
 // lane's. On synthetic lanes that are drawn where they are driven it is 0.0034 and 0.0021, and steered away.
-/// Mean angle between a centre line and the way that vehicles drive, radians: roughly a third more where it
-/// is slow, as on recorded roads.
+/// Mean angle between a centre line and the way that vehicles drive in a scene, radians: about twice as large
+/// where traffic is slow as where it is fast, as on recorded roads.
 const ASKEW: std::ops::Range<f64> = 0.003..0.013;
 /// The same where more than this is allowed, m/s.
 const ASKEW_FAST: std::ops::Range<f64> = 0.002..0.007;

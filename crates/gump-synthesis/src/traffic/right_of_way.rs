@@ -66,7 +66,7 @@ impl TrafficSimulation<'_> {
     pub(super) fn distance_to_stop(&self, i: usize) -> Option<f64> {
         let vehicle = &self.vehicles[i];
         if let Some(wait) = vehicle.wait {
-            let leg = vehicle.path.iter().position(|lane| *lane == wait.lane)?;
+            let leg = vehicle.leg_on(wait.lane)?;
             return Some(vehicle.distance_to(self.network, leg) + wait.until);
         }
         let leg = vehicle.next_connector(self.network)?;

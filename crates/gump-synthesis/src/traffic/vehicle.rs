@@ -171,10 +171,15 @@ impl Vehicle {
     /// Arc length of the rear measured from the start of `lane`, which is on the path; before it
     /// negative, after it more than its length.
     pub(crate) fn rear_on(&self, network: &Network, lane: LaneIdx) -> Option<f64> {
-        // The last lanes driven suffice: claims are given up soon after a junction.
-        let nearby = self.leg.saturating_sub(3)..self.path.len();
-        let leg = nearby.into_iter().find(|&leg| self.path[leg] == lane)?;
+        let leg = self.leg_on(lane)?;
         Some(-self.distance_to(network, leg) - self.length())
+    }
+
+    /// Where on the path a lane is, among those ahead and the last ones driven.
+    pub(crate) fn leg_on(&self, lane: LaneIdx) -> Option<usize> {
+        // The last lanes driven suffice: claims are given up soon after a junction.
+        let mut nearby = self.leg.saturating_sub(3)..self.path.len();
+        nearby.find(|&leg| self.path[leg] == lane)
     }
 
     /// The next connector at or ahead of the front, as an index into the path.

@@ -33,7 +33,7 @@ impl TrafficSimulation<'_> {
             let Some(wait) = vehicle.wait else {
                 continue;
             };
-            let leg = vehicle.path.iter().position(|lane| *lane == wait.lane);
+            let leg = vehicle.leg_on(wait.lane);
             let claimed = leg.filter(|_| vehicle.claims.contains(&wait.lane));
             self.vehicles[i].wait = claimed.and_then(|leg| {
                 let distance = self.vehicles[i].distance_to(self.network, leg);
@@ -146,11 +146,7 @@ mod tests {
             for ((_, id), began) in &now {
                 let vehicle = traffic.vehicles.iter().find(|v| v.id == *id).unwrap();
                 let wait = vehicle.wait.unwrap();
-                let leg = vehicle
-                    .path
-                    .iter()
-                    .position(|lane| *lane == wait.lane)
-                    .unwrap();
+                let leg = vehicle.leg_on(wait.lane).unwrap();
                 let front = -vehicle.distance_to(traffic.network, leg);
                 assert!(front < wait.until + ROOM, "{front} of {}", wait.until);
                 inside += usize::from(front > LEAST && vehicle.speed < 0.5);
