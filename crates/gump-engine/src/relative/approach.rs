@@ -138,6 +138,7 @@ mod tests {
                 pose: now.pose,
                 speed: 6.0,
                 seed: Seed(seed),
+                remains: false,
             };
             let routes = (0..64).filter_map(|seed| Route::from_here(&map, who(seed)));
             let mut routes = routes.filter(|route| route.lanes().contains(&LaneId(lane)));
@@ -168,6 +169,7 @@ mod tests {
             pose: start.pose,
             speed: 6.0,
             seed: Seed(seed),
+            remains: false,
         };
         let routes = (0..64).filter_map(|seed| Route::from_here(&map, who(seed)));
         let mut turns = routes.filter(|route| route.lanes().contains(&LaneId(3)));

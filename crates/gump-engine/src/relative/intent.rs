@@ -73,8 +73,15 @@ impl Intent {
         self.turns_in.is_some()
     }
 
-    /// Half a second later. `seed` is the agent's own, `frame` the index of the frame.
-    pub(super) fn go_on(&mut self, map: &MapGraph, now: &Shown, seed: Seed, frame: usize) {
+    /// Half a second later. `seed` is the agent's own, `frame` the index of the frame; one that `remains`
+    /// keeps to the map.
+    pub(super) fn go_on(
+        &mut self,
+        map: &MapGraph,
+        now: &Shown,
+        (seed, remains): (Seed, bool),
+        frame: usize,
+    ) {
         if now.body.kind != AgentKind::Vehicle || self.turns_in.is_some() {
             return;
         }
@@ -82,6 +89,7 @@ impl Intent {
             pose: now.pose,
             speed: now.velocity().length(),
             seed,
+            remains,
         };
         let stands = who.speed == 0.0;
         if stands && self.route.is_some() {
@@ -184,7 +192,12 @@ mod tests {
             for frame in 0..120 {
                 driven += 1;
                 let mut x = 10.0 + 4.0 * f64::from(frame);
-                intent.go_on(map, &car(Pose::new(x, 0.0, 0.0), 8.0), seed, frame as usize);
+                intent.go_on(
+                    map,
+                    &car(Pose::new(x, 0.0, 0.0), 8.0),
+                    (seed, false),
+                    frame as usize,
+                );
                 if intent.changing_s.is_none() {
                     assert_eq!(intent.route().unwrap().lanes(), [LaneId(1)]);
                     continue;
@@ -193,13 +206,18 @@ mod tests {
                 assert_eq!(intent.route().unwrap().lanes(), [LaneId(2)]);
                 // On the way over it stays decided, and there it is not any more.
                 x += 4.0;
-                intent.go_on(map, &car(Pose::new(x, 1.5, 0.1), 8.0), seed, 200);
+                intent.go_on(map, &car(Pose::new(x, 1.5, 0.1), 8.0), (seed, false), 200);
                 assert!(intent.changing_s.is_some());
                 // At a frame at which it does not decide to go back at once.
                 let rate = CHANGES_PER_MINUTE / 60.0 * TOKEN_DT;
                 let decides = |frame: usize| uniform(seed.fork(CHANGES).fork(frame as u64)) < rate;
                 let frame = (201..).find(|frame| !decides(*frame)).unwrap();
-                intent.go_on(map, &car(Pose::new(x + 4.0, 3.4, 0.0), 8.0), seed, frame);
+                intent.go_on(
+                    map,
+                    &car(Pose::new(x + 4.0, 3.4, 0.0), 8.0),
+                    (seed, false),
+                    frame,
+                );
                 assert!(intent.changing_s.is_none());
                 assert_eq!(intent.route().unwrap().lanes(), [LaneId(2)]);
                 break;
@@ -220,6 +238,7 @@ mod tests {
             pose: here,
             speed: 8.0,
             seed: Seed(1),
+            remains: false,
         };
         let mut intent = Intent {
             route: Some(Route::into_lane(map, LaneId(2), who)),
@@ -228,12 +247,12 @@ mod tests {
         };
         for frame in 0..18 {
             let x = 50.0 + 4.0 * f64::from(frame);
-            intent.go_on(map, &car(Pose::new(x, 0.0, 0.0), 8.0), Seed(1), 0);
+            intent.go_on(map, &car(Pose::new(x, 0.0, 0.0), 8.0), (Seed(1), false), 0);
         }
         assert!(intent.changing_s.is_none());
         assert_eq!(intent.route().unwrap().lanes(), [LaneId(1)]);
         for frame in 0..5000 {
-            intent.go_on(map, &car(here, 0.0), Seed(1), frame);
+            intent.go_on(map, &car(here, 0.0), (Seed(1), false), frame);
         }
         assert_eq!(intent.route().unwrap().lanes(), [LaneId(1)]);
     }

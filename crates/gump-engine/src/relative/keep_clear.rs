@@ -219,6 +219,7 @@ mod tests {
                 pose: Pose::new(x, 0.0, 0.0),
                 speed: 6.0,
                 seed: Seed(0),
+                remains: false,
             };
             let routes = (0..64).filter_map(|seed| {
                 let seed = Seed(seed);

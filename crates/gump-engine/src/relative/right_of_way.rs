@@ -475,7 +475,12 @@ mod tests {
         assert_eq!(turns(None), [false, true]);
         for seed in (0..8).map(gump_scene::Seed) {
             let speed = 8.0;
-            let who = |pose| Traveller { pose, speed, seed };
+            let who = |pose| Traveller {
+                pose,
+                speed,
+                seed,
+                remains: false,
+            };
             let route = Route::from_here(map, who(own.pose)).unwrap();
             assert_eq!(turns(Some(&route)), [route.lanes()[1] == LaneId(12)]);
         }
@@ -484,6 +489,7 @@ mod tests {
             pose: Pose::new(52.0, -40.0, SOUTH),
             speed: 8.0,
             seed: gump_scene::Seed(1),
+            remains: false,
         };
         let other = Route::from_here(map, other);
         assert_eq!(turns(other.as_ref()), [false, true]);

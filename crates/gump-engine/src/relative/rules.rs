@@ -870,6 +870,7 @@ mod tests {
                 pose: now.pose,
                 speed: 1.0,
                 seed: Seed(seed),
+                remains: false,
             };
             let routes = (0..64).filter_map(|seed| Route::from_here(&map.map, who(seed)));
             let route = routes

@@ -41,7 +41,7 @@ use crate::relative::rules::{
 };
 use crate::relative::seen::{FrameIndex, ObservedAgent, add_presents};
 use crate::relative::turning_in::TakesWay;
-use crate::relative::waiting::{INSISTS_S, Standing, has_room_behind, released};
+use crate::relative::waiting::{AT_GREEN_S, INSISTS_S, Standing, has_room_behind, released};
 use crate::sampling::{Routes, SamplingConfig};
 
 pub use live::LiveFuture;
@@ -696,7 +696,10 @@ impl Future {
         for member in members.filter(|member| driven != Some(member.agent.id)) {
             let stream = seed.fork(member.agent.id.0 as u64);
             let now = member.now();
-            member.intent.go_on(map, &now, stream, self.frames);
+            let remains = member.agent.id == self.scene.ego;
+            member
+                .intent
+                .go_on(map, &now, (stream, remains), self.frames);
             let route = member.intent.route().cloned();
             member.seen.head_for(route);
         }
@@ -748,7 +751,11 @@ impl Future {
                 route: None,
             });
             let all: Vec<_> = members.chain(others).collect();
-            let released = released(map, &self.lights, &all, is_late);
+            let shown = self.shown_lights.by_lane.iter();
+            let is_fresh = |elapsed: Option<f64>| elapsed.is_some_and(|s| s < AT_GREEN_S);
+            let fresh = shown.filter(|light| is_fresh(light.2)).map(|light| light.0);
+            let fresh: Vec<_> = fresh.collect();
+            let released = released(map, &self.lights, &fresh, &all, is_late);
             let backs_up = released.back_up.into_iter();
             for (i, blocked) in backs_up.filter(|_| self.scene.has_rules) {
                 self.members[i].backing = BACKS_UP + WAITS_BACK;

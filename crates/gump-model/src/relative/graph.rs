@@ -659,7 +659,16 @@ mod tests {
         );
         for seed in (0..8).map(gump_scene::Seed) {
             let speed = 8.0;
-            let route = Route::from_here(&scenario.map, Traveller { pose, speed, seed }).unwrap();
+            let route = Route::from_here(
+                &scenario.map,
+                Traveller {
+                    pose,
+                    speed,
+                    seed,
+                    remains: false,
+                },
+            )
+            .unwrap();
             let (on, off) = match route.lanes()[1].0 {
                 2 => (2, 3),
                 _ => (3, 2),

@@ -52,6 +52,10 @@ const TO_A_SIDE: f64 = 0.2;
 const BACK: f64 = 0.02;
 /// ... and of one that the vehicle is too fast for.
 const TOO_FAST: f64 = 0.01;
+/// Who remains on the map takes no way on which it ends after less than this share of the longest one, of
+/// which so many metres count: at 50 km/h half a minute.
+const LONG_ENOUGH: f64 = 0.75;
+const REMAINS_M: f64 = 400.0;
 /// How drivers take bends.
 const BENDS: BendLimits = BendLimits {
     lateral_mps2: 3.0,
@@ -76,6 +80,8 @@ pub struct Traveller {
     pub speed: f64,
     /// Its seed.
     pub seed: Seed,
+    /// Whether it takes none of the ways that soon end, where others go on.
+    pub remains: bool,
 }
 
 /// A lane that a vehicle may be on.
@@ -249,6 +255,21 @@ fn following<'a>(map: &'a MapGraph, lane: &Lane, ahead: f64, who: Traveller) -> 
             _ => TO_A_SIDE,
         };
     }
+    if who.remains {
+        let most = |lane: &Lane| lasts(map, lane, REMAINS_M);
+        let lasting: Vec<f64> = next.iter().map(|(lane, _)| most(lane)).collect();
+        // Those that it can take.
+        let able = next
+            .iter()
+            .zip(&lasting)
+            .filter(|((_, weight), _)| *weight > TOO_FAST);
+        let longest = able.map(|(_, metres)| *metres).fold(0.0, f64::max);
+        for ((_, weight), metres) in next.iter_mut().zip(&lasting) {
+            if *metres < LONG_ENOUGH * longest {
+                *weight = 0.0;
+            }
+        }
+    }
     let total: f64 = next.iter().map(|(_, weight)| weight).sum();
     let stream = who.seed.fork(lane.id.0 as u64);
     let mut left = total * stream.rng().random::<f64>();
@@ -257,6 +278,27 @@ fn following<'a>(map: &'a MapGraph, lane: &Lane, ahead: f64, who: Traveller) -> 
         left < 0.0
     });
     found.or(next.last()).map(|(lane, _)| *lane)
+}
+
+/// How far one can drive from the start of a lane, metres, up to `most`.
+fn lasts(map: &MapGraph, lane: &Lane, most: f64) -> f64 {
+    let mut farthest: BTreeMap<LaneId, f64> = BTreeMap::new();
+    let mut open = vec![(lane, 0.0)];
+    let mut longest: f64 = 0.0;
+    while let Some((lane, driven)) = open.pop() {
+        let before = farthest.entry(lane.id).or_insert(f64::NEG_INFINITY);
+        if driven <= *before {
+            continue;
+        }
+        *before = driven;
+        let driven = driven + lane.centerline.length();
+        longest = longest.max(driven);
+        if longest >= most {
+            return most;
+        }
+        open.extend(map.successors(lane.id).map(|next| (next, driven)));
+    }
+    longest
 }
 
 /// The direction in which a lane leads from its start to [`LEADS_M`] on, along the straightest way,
@@ -391,7 +433,16 @@ pub fn of_log(map: &MapGraph, poses: &[Option<Pose>], seed: Seed) -> Vec<Option<
         let before = t.checked_sub(1).and_then(|before| poses[before]);
         let driven = before.map_or(0.0, |before| before.position.distance(pose.position));
         let speed = driven / TOKEN_DT;
-        Some(Route::extended(map, way, Traveller { pose, speed, seed }))
+        Some(Route::extended(
+            map,
+            way,
+            Traveller {
+                pose,
+                speed,
+                seed,
+                remains: false,
+            },
+        ))
     };
     (0..n).map(route).collect()
 }
@@ -420,6 +471,7 @@ mod tests {
             pose,
             speed: 3.0,
             seed: Seed(seed),
+            remains: false,
         }
     }
 
@@ -457,6 +509,39 @@ mod tests {
             of_log(map, &[Some(Pose::new(50.0, -6.0, 0.0)), None], Seed(1)),
             [None, None]
         );
+    }
+
+    #[test]
+    fn who_remains_on_the_map_takes_the_way_that_goes_on() {
+        // The turn leads into a ring, straight on the map ends.
+        let scenario = gump_scene::fixture::scenario(
+            "lane 1: 0,0 100,0 speed 15 next 3,4
+             lane 3: 100,0 200,0
+             lane 4: 100,0 108,-2 110,-10 110,-40 next 5
+             lane 5: 110,-40 60,-90 next 6
+             lane 6: 60,-90 110,-40 next 5
+             ego vehicle 0: 10,0 velocity 8,0",
+        )
+        .unwrap();
+        let map = &scenario.map;
+        let ways = |speed: f64, remains: bool| {
+            let way = |seed: u64| {
+                let who = Traveller {
+                    speed,
+                    remains,
+                    ..slow(Pose::new(90.0, 0.0, 0.0), seed)
+                };
+                Route::from_here(map, who).unwrap().after(LaneId(1))
+            };
+            let turns = |seed: &u64| way(*seed) == Some(LaneId(4));
+            (0..100).filter(turns).count()
+        };
+        assert_eq!(ways(3.0, true), 100);
+        assert!((5..40).contains(&ways(3.0, false)));
+        assert!(ways(15.0, true) < 5, "too fast for the turn");
+        let metres = |id: i64, most: f64| lasts(map, map.lane(LaneId(id)).unwrap(), most);
+        assert_eq!(metres(3, 400.0), 100.0);
+        assert_eq!(metres(4, 400.0), 400.0);
     }
 
     #[test]
@@ -519,7 +604,15 @@ mod tests {
             let route = routes.iter().find(turn).unwrap();
             let pose = Pose::new(x, 0.0, 0.0);
             let seed = Seed(1);
-            route.is_missed(map, Traveller { pose, speed, seed })
+            route.is_missed(
+                map,
+                Traveller {
+                    pose,
+                    speed,
+                    seed,
+                    remains: false,
+                },
+            )
         };
         assert!(misses(true, 92.0, 14.0) && !misses(false, 92.0, 14.0));
         assert!(!misses(true, 92.0, 6.0) && !misses(true, 50.0, 14.0));
@@ -532,7 +625,16 @@ mod tests {
             let drawn = (0..200).map(|seed| {
                 let pose = Pose::new(x, 0.0, 0.0);
                 let seed = Seed(seed);
-                Route::from_here(map, Traveller { pose, speed, seed }).unwrap()
+                Route::from_here(
+                    map,
+                    Traveller {
+                        pose,
+                        speed,
+                        seed,
+                        remains: false,
+                    },
+                )
+                .unwrap()
             });
             drawn
                 .filter(|route| route.lanes().contains(&LaneId(4)))

@@ -668,6 +668,7 @@ fn told_route(
         pose: now.pose,
         speed: now.velocity().length(),
         seed,
+        remains: false,
     };
     let kept = || seen.route()?.from_there(streets, who, true);
     logged.filter(is_near).cloned().or_else(kept)
