@@ -72,6 +72,9 @@ const NO_FARTHER_M: f64 = 5.0;
 /// The speed of a restarted agent, metres per second. With 2 m/s vehicles start more often than in the
 /// log (result 23).
 const START: f64 = 1.01;
+/// The same, after a benchmark's time, of one that was seen to drive: slower ones often stop again (result
+/// 53).
+const SETS_OFF: f64 = 3.0;
 /// After as many steps, nine seconds, vehicles without a reason to slow down are shown without
 /// their past (see [`View::is_free`](gump_model::relative::graph::View::is_free)), and are given
 /// routes.
@@ -784,7 +787,11 @@ impl Future {
                 }
                 member.could_go = true;
                 limits[i] = None;
-                member.seen.restart(engine, START);
+                let speed = match is_late && member.has_driven {
+                    true => SETS_OFF,
+                    false => START,
+                };
+                member.seen.restart(engine, speed);
             }
         }
         for (member, limit) in self.members.iter_mut().zip(limits) {
