@@ -437,38 +437,69 @@ fn a_relative_network_trains_in_stages_and_goes_on_where_it_stopped() {
 }
 
 #[test]
-fn the_weights_of_a_run_can_be_the_mean_of_its_last_stages() {
+fn weights_can_be_the_mean_of_those_of_stages() {
     let place = Workplace::new();
-    let averaged = |n: usize| {
-        RELATIVE.replace(
-            "[train]",
-            &format!("[weights]\nmean_of_stages = {n}\n[train]"),
-        )
-    };
-    fs::write(place.path("mean.toml"), averaged(2)).unwrap();
-    place.results("mean.toml", "out");
     let weights = |path: &str| {
-        let path = place.path(&format!("out/{path}weights.safetensors"));
-        let network = relative::load(&path, &Device::Cpu).unwrap();
+        let network = relative::load(&place.path(path), &Device::Cpu).unwrap();
         let all = network.parameters().all();
         let all = all.map(|(_, var)| var.flatten_all().unwrap().to_vec1::<f32>().unwrap());
         all.flatten().collect::<Vec<f32>>()
     };
-    let [mean, first, second] = ["", "stage-1/", "stage-2/"].map(weights);
-    assert_ne!(first, second);
-    for ((mean, first), second) in mean.iter().zip(&first).zip(&second) {
-        // Files have half precision, of 11 bits.
-        let expected = f32::midpoint(*first, *second);
-        assert!(
-            (mean - expected).abs() <= 2e-3 * (first.abs() + second.abs()) + 1e-6,
-            "{mean} of {first} and {second}"
-        );
-    }
-    fs::write(place.path("mean.toml"), averaged(3)).unwrap();
-    place.fails("mean.toml", 2, &["mean_of_stages is 3", "1 to 2"]);
-    let stage = RELATIVE.replace("[[stage]]\n", "[[stage]]\nweights = {mean_of_stages = 2}\n");
-    fs::write(place.path("mean.toml"), stage).unwrap();
+    let check_mean = |mean: &str, of: &[&str]| {
+        let all: Vec<_> = of.iter().map(|path| weights(path)).collect();
+        for (i, mean) in weights(mean).iter().enumerate() {
+            // Files have half precision, of 11 bits.
+            let sum: f32 = all.iter().map(|one| one[i]).sum();
+            let size: f32 = all.iter().map(|one| one[i].abs()).sum();
+            let expected = sum / all.len() as f32;
+            assert!(
+                (mean - expected).abs() <= 2e-3 * size + 1e-6,
+                "{mean} of {of:?}"
+            );
+        }
+    };
+    let of =
+        |list: &str| RELATIVE.replace("[train]", &format!("[weights]\nmean_of = {list}\n[train]"));
+    fs::write(place.path("mean.toml"), of("[1, 2]")).unwrap();
+    place.results("mean.toml", "out");
+    let [first, second] = [
+        "out/stage-1/weights.safetensors",
+        "out/stage-2/weights.safetensors",
+    ];
+    assert_ne!(weights(first), weights(second));
+    check_mean("out/weights.safetensors", &[first, second]);
+
+    // A second run from the first one, whose last stage goes back to the start, without taking a step away
+    // from it: its learning rate is as good as 0.
+    let last = "[[stage]]\nfrom = [0, 1]\n[stage.train]\nsteps = 1\n[stage.train.optimizer]\nlearning_rate = 1e-9\n";
+    fs::write(place.path("mean.toml"), format!("{}\n{last}", of("[0, 3]"))).unwrap();
+    place.results("mean.toml --from out/weights.safetensors", "again");
+    let [start, first, third] = [
+        "out/weights",
+        "again/stage-1/weights",
+        "again/stage-3/weights",
+    ]
+    .map(|path| format!("{path}.safetensors"));
+    check_mean(&third, &[&start, &first]);
+    check_mean("again/weights.safetensors", &[&start, &third]);
+
+    fs::write(place.path("mean.toml"), of("[3]")).unwrap();
+    place.fails("mean.toml", 2, &["mean_of is [3]", "0 to 2"]);
+    fs::write(place.path("mean.toml"), of("[0, 1]")).unwrap();
+    place.fails(
+        "mean.toml",
+        2,
+        &["stage 0 is the weights of --from, found none"],
+    );
+    let stage = |key: &str| RELATIVE.replace("[[stage]]\n", &format!("[[stage]]\n{key}\n"));
+    fs::write(place.path("mean.toml"), stage("weights = {mean_of = [1]}")).unwrap();
     place.fails("mean.toml", 2, &["unknown key weights"]);
+    fs::write(place.path("mean.toml"), stage("from = [1]")).unwrap();
+    place.fails(
+        "mean.toml",
+        2,
+        &["from is [1], expected a list of stages, 0 to 0"],
+    );
 }
 
 #[cfg(not(feature = "mpi"))]

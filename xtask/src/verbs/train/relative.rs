@@ -26,6 +26,9 @@ use crate::losses::Losses;
 use crate::peers::Processes;
 use crate::run::Run;
 
+/// The weights of `--from`, if a stage goes back to them.
+const INITIAL: &str = "initial-weights.safetensors";
+
 /// The name of the architecture in `--model`.
 pub(super) const NAME: &str = "relative";
 
@@ -47,17 +50,11 @@ struct Config {
 }
 
 /// What the weights of a run are.
-#[derive(Debug, Deserialize)]
+#[derive(Debug, Default, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Weights {
-    /// The mean of those of so many stages, the last ones.
-    mean_of_stages: usize,
-}
-
-impl Default for Weights {
-    fn default() -> Self {
-        Self { mean_of_stages: 1 }
-    }
+    /// The mean of those of these stages, from 1 on, 0 being those of `--from`; without, the last one.
+    mean_of: Vec<usize>,
 }
 
 /// Whether the arguments request this network: by name, or by the initial weights.
@@ -83,13 +80,19 @@ pub(super) fn execute(args: &Args, run: &mut Run, processes: &Processes) -> anyh
         return Err(WrongArguments(wrong).into());
     }
     let stages = args.stages_of(&known_keys()?, |table| config(args, table))?;
-    let averaged = stages[0].config.weights.mean_of_stages;
-    if averaged == 0 || averaged > stages.len() {
+    let mean_of = &stages[0].config.weights.mean_of;
+    if mean_of.iter().any(|stage| *stage > stages.len()) {
         let wrong = format!(
-            "weights.mean_of_stages is {averaged}, expected 1 to {}, the number of stages",
+            "weights.mean_of is {mean_of:?}, expected numbers of stages, 0 to {}",
             stages.len()
         );
         return Err(WrongArguments(wrong).into());
+    }
+    let begins = stages.iter().filter_map(|stage| stage.from.as_ref());
+    let returns = begins.chain([mean_of]).any(|stages| stages.contains(&0));
+    if returns && args.from.is_none() && !args.resume {
+        let wrong = "stage 0 is the weights of --from, found none";
+        return Err(WrongArguments(wrong.into()).into());
     }
     let was_begun = |stage: &Stage<Config>| run.path(&stage.files.path(CHECKPOINT)).is_file();
     let mut resume = args.resume;
@@ -101,20 +104,39 @@ pub(super) fn execute(args: &Args, run: &mut Run, processes: &Processes) -> anyh
         Some(weights) => Some(from(weights, &stages[0].config, run.device())?),
         None => None,
     };
+    let initial = run.path(INITIAL);
+    if let Some(network) = network.as_ref().filter(|_| returns) {
+        std::fs::create_dir_all(run.path(""))?;
+        relative::save(network, &initial, StorageType::Half)?;
+    }
+    let mean = |of: &[usize], run: &Run| -> anyhow::Result<RelativeNetwork> {
+        let load = |stage: &usize| {
+            let path = match stage.checked_sub(1) {
+                None => initial.clone(),
+                Some(i) => run.path(&stages[i].files.path(WEIGHTS)),
+            };
+            relative::load(&path, run.device())
+        };
+        let networks = of.iter().map(load).collect::<Result<Vec<_>, _>>()?;
+        Ok(RelativeNetwork::mean(&networks)?)
+    };
     for stage in &stages[first..] {
+        if let Some(of) = stage.from.as_ref().filter(|_| !resume) {
+            network = Some(mean(of, run)?);
+        }
         network = Some(train(args, stage, resume, network, run)?);
         resume = false;
     }
     let weights = run.path(WEIGHTS);
-    if let Some(network) = network.filter(|_| stages.len() > 1) {
-        let mut last = vec![network];
-        for stage in stages.iter().rev().skip(1).take(averaged - 1) {
-            last.push(relative::load(
-                &run.path(&stage.files.path(WEIGHTS)),
-                run.device(),
-            )?);
-        }
-        relative::save(&RelativeNetwork::mean(&last)?, &weights, StorageType::Half)?;
+    // Without stages they are there.
+    if !stages[0].files.is_of_the_run() {
+        let last = [stages.len()];
+        let of = if mean_of.is_empty() {
+            &last[..]
+        } else {
+            mean_of
+        };
+        relative::save(&mean(of, run)?, &weights, StorageType::Half)?;
     }
     run.result("resumed", args.resume)?;
     run.result("weights", weights)
@@ -267,7 +289,7 @@ fn known_keys() -> anyhow::Result<Table> {
     known.insert("model".into(), NAME.into());
     let shape = Table::try_from(RelativeConfig::default())?;
     known.insert("relative".into(), shape.into());
-    let weights = Table::from_iter([("mean_of_stages".to_owned(), 1.into())]);
+    let weights = Table::from_iter([("mean_of".to_owned(), toml::Value::Array(Vec::new()))]);
     known.insert("weights".into(), weights.into());
     let realism = RelativeRewards {
         kl_target: Some(0.0),

@@ -27,6 +27,9 @@ pub(super) struct Stage<C = RunConfig> {
     pub(super) config: C,
     /// Sources of training data, each with `=SHARE` if the shares are not equal.
     pub(super) data: Vec<PathBuf>,
+    /// The stages whose weights it begins with the mean of, 0 being those of `--from`; without, the one
+    /// before.
+    pub(super) from: Option<Vec<usize>>,
     pub(super) files: Files,
 }
 
@@ -40,6 +43,11 @@ pub(super) struct Files {
 }
 
 impl Files {
+    /// Whether they are those of the run, which has no stages.
+    pub(super) fn is_of_the_run(&self) -> bool {
+        self.folder.as_os_str().is_empty()
+    }
+
     /// Path of a file of the stage, relative to the folder of the run.
     pub(super) fn path(&self, name: &str) -> String {
         self.folder.join(name).display().to_string()
@@ -82,6 +90,7 @@ impl Args {
             return Ok(vec![Stage {
                 config: config(&table)?,
                 data: vec![self.data.clone()],
+                from: None,
                 files: Files {
                     stop_at: self.stop_at.unwrap_or(usize::MAX),
                     folder: PathBuf::new(),
@@ -93,6 +102,9 @@ impl Args {
             return Err(WrongArguments(wrong.into()).into());
         }
         let mut known = known.clone();
+        if known.contains_key("weights") {
+            known.insert("from".into(), Value::Array(Vec::new()));
+        }
         for of_the_run in ["model", "relative", "weights"] {
             known.remove(of_the_run);
         }
@@ -110,6 +122,10 @@ impl Args {
             Ok(Stage {
                 config: config(&table)?,
                 data: self.data_of(path, stage.get("data"))?,
+                from: match stage.get("from") {
+                    None => None,
+                    Some(from) => Some(stages_before(path, i + 1, from)?),
+                },
                 files: Files {
                     stop_at: match stage.get("stop_at") {
                         Some(Value::Integer(step)) if *step > 0 => *step as usize,
@@ -151,6 +167,22 @@ impl Args {
             .map_err(|error| wrong(error.to_string()))?;
         Ok(config)
     }
+}
+
+/// Numbers of stages before stage `i`, at least one.
+fn stages_before(path: &Path, i: usize, from: &Value) -> anyhow::Result<Vec<usize>> {
+    let number = |value: &Value| value.as_integer().and_then(|n| usize::try_from(n).ok());
+    let numbers = from.as_array().into_iter().flatten();
+    let numbers: Option<Vec<usize>> = numbers.map(number).collect();
+    let numbers = numbers.filter(|all| !all.is_empty() && all.iter().all(|n| *n < i));
+    numbers.ok_or_else(|| {
+        wrong(
+            path,
+            "from",
+            &format!("a list of stages, 0 to {}", i - 1),
+            from,
+        )
+    })
 }
 
 fn wrong(path: &Path, key: &str, expected: &str, found: &Value) -> anyhow::Error {
