@@ -2,7 +2,7 @@
 
 use gump_model::relative::driveway::Driveways;
 use gump_model::relative::graph::Shown;
-use gump_model::relative::route::{Route, Traveller};
+use gump_model::relative::route::{LONG_ENOUGH, Route, Traveller, lasts_m};
 use gump_model::steps::TOKEN_DT;
 use gump_scene::{Agent, AgentKind, Lane, LaneId, MapGraph, Seed};
 
@@ -123,7 +123,8 @@ impl Intent {
     fn decide_on_a_change(&mut self, map: &MapGraph, who: Traveller, frame: usize) {
         let stream = who.seed.fork(CHANGES).fork(frame as u64);
         let rate = CHANGES_PER_MINUTE / 60.0 * TOKEN_DT;
-        if uniform(stream) >= rate || who.speed < FAST_MPS {
+        let wishes = uniform(stream) < rate;
+        if !(wishes || who.remains) || who.speed < FAST_MPS {
             return;
         }
         let here = self.route.as_ref().and_then(|route| route.lanes().first());
@@ -143,7 +144,10 @@ impl Intent {
             let mut lanes = side.iter().filter_map(|id| map.lane(*id));
             lanes.find(is_beside)
         });
-        let beside: Vec<&Lane> = beside.into_iter().flatten().collect();
+        let mut beside: Vec<&Lane> = beside.into_iter().flatten().collect();
+        if who.remains {
+            beside = longest(map, here, beside, wishes);
+        }
         if beside.is_empty() {
             return;
         }
@@ -153,6 +157,17 @@ impl Intent {
         self.route = Some(Route::into_lane(map, lane, who));
         self.changing_s = Some(0.0);
     }
+}
+
+/// The lanes beside `here` on which one that remains on the map may change: those that go on where it ends,
+/// and, if it `wishes` to change anyway, those that go on as well.
+fn longest<'a>(map: &MapGraph, here: &Lane, beside: Vec<&'a Lane>, wishes: bool) -> Vec<&'a Lane> {
+    let own = lasts_m(map, here);
+    let goes_on = |lane: &&Lane| {
+        let metres = lasts_m(map, lane);
+        own < LONG_ENOUGH * metres || wishes && metres >= LONG_ENOUGH * own
+    };
+    beside.into_iter().filter(goes_on).collect()
 }
 
 #[cfg(test)]
@@ -255,5 +270,29 @@ mod tests {
             intent.go_on(map, &car(here, 0.0), (Seed(1), false), frame);
         }
         assert_eq!(intent.route().unwrap().lanes(), [LaneId(1)]);
+    }
+
+    #[test]
+    fn who_remains_on_the_map_changes_to_the_lane_that_goes_on() {
+        // The right lane ends, the left one leads on; both at first, or none.
+        let scenario = gump_scene::fixture::scenario(
+            "lane 1: 0,0 100,0 speed 15 left 2
+             lane 2: 0,3.5 100,3.5 speed 15 right 1 next 3
+             lane 3: 100,3.5 900,3.5 speed 15
+             ego vehicle 0: 10,0 velocity 8,0",
+        )
+        .unwrap();
+        let changes = |y: f64, remains: bool| {
+            let changes = |seed: &u64| {
+                let mut intent = Intent::default();
+                let who = (Seed(*seed), remains);
+                intent.go_on(&scenario.map, &car(Pose::new(20.0, y, 0.0), 8.0), who, 30);
+                intent.changing_s.is_some()
+            };
+            (0..200).filter(changes).count()
+        };
+        assert_eq!(changes(0.0, true), 200);
+        assert_eq!(changes(3.5, true), 0);
+        assert!((1..20).contains(&changes(0.0, false)) && (1..20).contains(&changes(3.5, false)));
     }
 }

@@ -90,6 +90,9 @@ const DRIVEN_S: f64 = 3.0;
 /// was missed for over six seconds, in logs none (result 47). With 1 and 2 s the minutes of result 53 are the
 /// same.
 pub(super) const AT_GREEN_S: f64 = 1.5;
+/// After a benchmark's time one that was seen to drive passes those who were not, and have stood as long, if
+/// the way leads by their centre at this distance, metres.
+const PASSES_M: f64 = 0.5;
 /// A way to a place in a junction has at most so many lanes from its light on.
 const HOPS: usize = 4;
 /// One that does not squeeze past by then backs up, seconds, ...
@@ -191,9 +194,14 @@ pub(super) fn released(
         let insists = agents[i].waited_s > agents[i].patience_s + INSISTS_S;
         let is_held = |room: Room| {
             let room = Room { insists, ..room };
+            let passes = |other: &Standing<'_>| {
+                let drives = is_late && agents[i].has_driven && !other.has_driven;
+                drives && other.waited_s >= agents[i].waited_s && is_beside(&reached, &other.agent)
+            };
             let holding = |&j: &usize| {
                 let stays = waits(&j);
-                j != i && holds(&reached, agent, &agents[j].agent, stays, &room)
+                let holds = || holds(&reached, agent, &agents[j].agent, stays, &room);
+                j != i && !passes(&agents[j]) && holds()
             };
             (0..agents.len()).filter(holding).collect::<Vec<_>>()
         };
@@ -500,6 +508,13 @@ fn has_waited(map: &MapGraph, (lights, fresh): (&[Light], &[LaneId]), one: &Stan
     one.waited_s > DRIVEN_S || is_green()
 }
 
+/// Whether the way ahead leads by a vehicle's centre.
+fn is_beside(reached: &[LaneAhead<'_>], other: &Agent) -> bool {
+    let at = other.state.pose.position;
+    let beside = reached.iter().map(|part| part.locate(at).beside_m);
+    other.kind == AgentKind::Vehicle && beside.fold(f64::INFINITY, f64::min) > PASSES_M
+}
+
 /// Whether an agent is near a light's line, and its middle not over it.
 fn is_before(part: &LaneAhead<'_>, light: &Light, agent: &Agent) -> bool {
     (-agent.length / 2.0..LOOK_M).contains(&part.metres_to_stop_line(light))
@@ -660,6 +675,30 @@ mod tests {
         // Elsewhere later, and who may be parked, or within a benchmark's time, not for long.
         assert!(!goes("", 2.0, &[], (true, true)) && goes("", 3.5, &[], (true, true)));
         assert!(!goes(green, 9.0, &[], (false, true)) && !goes(green, 9.0, &[], (true, false)));
+    }
+
+    #[test]
+    fn who_was_seen_to_drive_passes_those_who_are_parked_beside_its_way() {
+        let goes = |y: f64, its_wait: f64, has_driven: bool| {
+            let text = format!("lane 1: 0,0 90,0\nego vehicle 0: 26,0.5\nagent vehicle 1: 32,{y}");
+            let scenario = scenario(&text);
+            let scene = scenario.present();
+            let of = |agent: &Agent| Standing {
+                agent: *agent,
+                waited_s: if agent.id.0 == 0 { 9.0 } else { its_wait },
+                patience_s: 20.0,
+                has_driven: agent.id.0 == 0 || has_driven,
+                route: None,
+            };
+            let agents: Vec<_> = scene.now().agents().iter().map(of).collect();
+            released(scene.map, &[], &[], &agents, true).go.contains(&0)
+        };
+        assert!(goes(-1.0, 30.0, false));
+        assert!(!goes(-0.2, 30.0, false), "in its way");
+        assert!(
+            !goes(-1.0, 30.0, true) && !goes(-1.0, 5.0, false),
+            "it may go on"
+        );
     }
 
     #[test]

@@ -54,7 +54,7 @@ const BACK: f64 = 0.02;
 const TOO_FAST: f64 = 0.01;
 /// Who remains on the map takes no way on which it ends after less than this share of the longest one, of
 /// which so many metres count: at 50 km/h half a minute.
-const LONG_ENOUGH: f64 = 0.75;
+pub const LONG_ENOUGH: f64 = 0.75;
 const REMAINS_M: f64 = 400.0;
 /// How drivers take bends.
 const BENDS: BendLimits = BendLimits {
@@ -256,8 +256,7 @@ fn following<'a>(map: &'a MapGraph, lane: &Lane, ahead: f64, who: Traveller) -> 
         };
     }
     if who.remains {
-        let most = |lane: &Lane| lasts(map, lane, REMAINS_M);
-        let lasting: Vec<f64> = next.iter().map(|(lane, _)| most(lane)).collect();
+        let lasting: Vec<f64> = next.iter().map(|(lane, _)| lasts_m(map, lane)).collect();
         // Those that it can take.
         let able = next
             .iter()
@@ -280,8 +279,8 @@ fn following<'a>(map: &'a MapGraph, lane: &Lane, ahead: f64, who: Traveller) -> 
     found.or(next.last()).map(|(lane, _)| *lane)
 }
 
-/// How far one can drive from the start of a lane, metres, up to `most`.
-fn lasts(map: &MapGraph, lane: &Lane, most: f64) -> f64 {
+/// How far one can drive from the start of a lane, metres, as far as counts for who remains on the map.
+pub fn lasts_m(map: &MapGraph, lane: &Lane) -> f64 {
     let mut farthest: BTreeMap<LaneId, f64> = BTreeMap::new();
     let mut open = vec![(lane, 0.0)];
     let mut longest: f64 = 0.0;
@@ -293,8 +292,8 @@ fn lasts(map: &MapGraph, lane: &Lane, most: f64) -> f64 {
         *before = driven;
         let driven = driven + lane.centerline.length();
         longest = longest.max(driven);
-        if longest >= most {
-            return most;
+        if longest >= REMAINS_M {
+            return REMAINS_M;
         }
         open.extend(map.successors(lane.id).map(|next| (next, driven)));
     }
@@ -539,9 +538,9 @@ mod tests {
         assert_eq!(ways(3.0, true), 100);
         assert!((5..40).contains(&ways(3.0, false)));
         assert!(ways(15.0, true) < 5, "too fast for the turn");
-        let metres = |id: i64, most: f64| lasts(map, map.lane(LaneId(id)).unwrap(), most);
-        assert_eq!(metres(3, 400.0), 100.0);
-        assert_eq!(metres(4, 400.0), 400.0);
+        let metres = |id: i64| lasts_m(map, map.lane(LaneId(id)).unwrap());
+        assert_eq!(metres(3), 100.0);
+        assert_eq!(metres(4), REMAINS_M);
     }
 
     #[test]
