@@ -91,7 +91,7 @@ const DRIVEN_S: f64 = 3.0;
 /// same.
 pub(super) const AT_GREEN_S: f64 = 1.5;
 /// After a benchmark's time one that was seen to drive passes those who were not, and have stood as long, if
-/// the way leads by their centre at this distance, metres.
+/// they are this far from the middle of all lanes, metres: who has waited at red since the start is not.
 const PASSES_M: f64 = 0.5;
 /// A way to a place in a junction has at most so many lanes from its light on.
 const HOPS: usize = 4;
@@ -196,7 +196,7 @@ pub(super) fn released(
             let room = Room { insists, ..room };
             let passes = |other: &Standing<'_>| {
                 let drives = is_late && agents[i].has_driven && !other.has_driven;
-                drives && other.waited_s >= agents[i].waited_s && is_beside(&reached, &other.agent)
+                drives && other.waited_s >= agents[i].waited_s && is_aside(map, &other.agent)
             };
             let holding = |&j: &usize| {
                 let stays = waits(&j);
@@ -508,11 +508,10 @@ fn has_waited(map: &MapGraph, (lights, fresh): (&[Light], &[LaneId]), one: &Stan
     one.waited_s > DRIVEN_S || is_green()
 }
 
-/// Whether the way ahead leads by a vehicle's centre.
-fn is_beside(reached: &[LaneAhead<'_>], other: &Agent) -> bool {
-    let at = other.state.pose.position;
-    let beside = reached.iter().map(|part| part.locate(at).beside_m);
-    other.kind == AgentKind::Vehicle && beside.fold(f64::INFINITY, f64::min) > PASSES_M
+/// Whether a vehicle is parked beside the middle of all lanes, as far as where it stands tells.
+fn is_aside(map: &MapGraph, other: &Agent) -> bool {
+    let mut lanes = map.lanes_near(other.state.pose.position, PASSES_M);
+    other.kind == AgentKind::Vehicle && lanes.next().is_none()
 }
 
 /// Whether an agent is near a light's line, and its middle not over it.
