@@ -324,6 +324,11 @@ fn the_recorded_stages_of_the_relative_network_can_be_run() {
     }
     on_these("relative-8.toml");
     place.results("relative-8.toml --steps 1", "on");
+    on_these("relative-9.toml");
+    place.results(
+        "relative-9.toml --steps 1 --from on/weights.safetensors",
+        "further",
+    );
     on_these("relative-parking.toml");
     place.results("relative-parking.toml --steps 1", "parking");
     on_these("placement.toml");
