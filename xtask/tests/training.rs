@@ -496,6 +496,17 @@ fn weights_can_be_the_mean_of_those_of_stages() {
         2,
         &["stage 0 is the weights of --from, found none"],
     );
+    let (whole, _) = RELATIVE.split_once("[[stage]]").unwrap();
+    fs::write(
+        place.path("mean.toml"),
+        format!("{whole}\n[weights]\nmean_of = [1]\n"),
+    )
+    .unwrap();
+    place.fails(
+        "mean.toml",
+        2,
+        &["mean_of counts stages, found no [[stage]]"],
+    );
     let stage = |key: &str| RELATIVE.replace("[[stage]]\n", &format!("[[stage]]\n{key}\n"));
     fs::write(place.path("mean.toml"), stage("weights = {mean_of = [1]}")).unwrap();
     place.fails("mean.toml", 2, &["unknown key weights"]);

@@ -146,7 +146,7 @@ impl Intent {
         });
         let mut beside: Vec<&Lane> = beside.into_iter().flatten().collect();
         if who.remains {
-            beside = longest(map, here, beside, wishes);
+            beside.retain(|lane| leads_on(map, here, lane, wishes));
         }
         if beside.is_empty() {
             return;
@@ -159,15 +159,11 @@ impl Intent {
     }
 }
 
-/// The lanes beside `here` on which one that remains on the map may change: those that go on where it ends,
-/// and, if it `wishes` to change anyway, those that go on as well.
-fn longest<'a>(map: &MapGraph, here: &Lane, beside: Vec<&'a Lane>, wishes: bool) -> Vec<&'a Lane> {
-    let own = lasts_m(map, here);
-    let goes_on = |lane: &&Lane| {
-        let metres = lasts_m(map, lane);
-        own < LONG_ENOUGH * metres || wishes && metres >= LONG_ENOUGH * own
-    };
-    beside.into_iter().filter(goes_on).collect()
+/// Whether one that remains on the map may change from `here` to a lane beside it: to one that goes on where
+/// this one ends, and, if it `wishes` to change anyway, to one that does not end sooner.
+fn leads_on(map: &MapGraph, here: &Lane, beside: &Lane, wishes: bool) -> bool {
+    let (own, metres) = (lasts_m(map, here), lasts_m(map, beside));
+    own < LONG_ENOUGH * metres || wishes && metres >= LONG_ENOUGH * own
 }
 
 #[cfg(test)]
@@ -274,7 +270,7 @@ mod tests {
 
     #[test]
     fn who_remains_on_the_map_changes_to_the_lane_that_goes_on() {
-        // The right lane ends, the left one leads on; both at first, or none.
+        // The right lane ends, the left one leads on.
         let scenario = gump_scene::fixture::scenario(
             "lane 1: 0,0 100,0 speed 15 left 2
              lane 2: 0,3.5 100,3.5 speed 15 right 1 next 3

@@ -201,7 +201,7 @@ pub(super) fn released(
             let holding = |&j: &usize| {
                 let stays = waits(&j);
                 let holds = || holds(&reached, agent, &agents[j].agent, stays, &room);
-                j != i && !passes(&agents[j]) && holds()
+                j != i && holds() && !passes(&agents[j])
             };
             (0..agents.len()).filter(holding).collect::<Vec<_>>()
         };

@@ -279,14 +279,15 @@ fn following<'a>(map: &'a MapGraph, lane: &Lane, ahead: f64, who: Traveller) -> 
     found.or(next.last()).map(|(lane, _)| *lane)
 }
 
-/// How far one can drive from the start of a lane, metres, as far as counts for who remains on the map.
+/// How far one can drive from the start of a lane, metres, as far as counts for who remains on the map: to a
+/// metre for each lane on the way, which bounds the time where lanes part and meet again.
 pub fn lasts_m(map: &MapGraph, lane: &Lane) -> f64 {
     let mut farthest: BTreeMap<LaneId, f64> = BTreeMap::new();
     let mut open = vec![(lane, 0.0)];
     let mut longest: f64 = 0.0;
     while let Some((lane, driven)) = open.pop() {
         let before = farthest.entry(lane.id).or_insert(f64::NEG_INFINITY);
-        if driven <= *before {
+        if driven < *before + 1.0 {
             continue;
         }
         *before = driven;
@@ -601,17 +602,8 @@ mod tests {
         let misses = |turns: bool, x: f64, speed: f64| {
             let turn = |route: &&Route| route.lanes().contains(&LaneId(4)) == turns;
             let route = routes.iter().find(turn).unwrap();
-            let pose = Pose::new(x, 0.0, 0.0);
-            let seed = Seed(1);
-            route.is_missed(
-                map,
-                Traveller {
-                    pose,
-                    speed,
-                    seed,
-                    remains: false,
-                },
-            )
+            let who = slow(Pose::new(x, 0.0, 0.0), 1);
+            route.is_missed(map, Traveller { speed, ..who })
         };
         assert!(misses(true, 92.0, 14.0) && !misses(false, 92.0, 14.0));
         assert!(!misses(true, 92.0, 6.0) && !misses(true, 50.0, 14.0));
@@ -622,18 +614,8 @@ mod tests {
         let map = &scenario().map;
         let turns = |x: f64, speed: f64| {
             let drawn = (0..200).map(|seed| {
-                let pose = Pose::new(x, 0.0, 0.0);
-                let seed = Seed(seed);
-                Route::from_here(
-                    map,
-                    Traveller {
-                        pose,
-                        speed,
-                        seed,
-                        remains: false,
-                    },
-                )
-                .unwrap()
+                let who = slow(Pose::new(x, 0.0, 0.0), seed);
+                Route::from_here(map, Traveller { speed, ..who }).unwrap()
             });
             drawn
                 .filter(|route| route.lanes().contains(&LaneId(4)))

@@ -88,6 +88,10 @@ pub(super) fn execute(args: &Args, run: &mut Run, processes: &Processes) -> anyh
         );
         return Err(WrongArguments(wrong).into());
     }
+    if !mean_of.is_empty() && stages[0].files.is_of_the_run() {
+        let wrong = "weights.mean_of counts stages, found no [[stage]]";
+        return Err(WrongArguments(wrong.into()).into());
+    }
     let begins = stages.iter().filter_map(|stage| stage.from.as_ref());
     let returns = begins.chain([mean_of]).any(|stages| stages.contains(&0));
     if returns && args.from.is_none() && !args.resume {
