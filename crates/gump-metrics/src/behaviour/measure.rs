@@ -37,6 +37,10 @@ pub enum Measure {
     ComeToRest,
     /// Speed, at a given time, of an agent that does not stand in the present, metres per second.
     Speed,
+    /// An agent is near the ego at a given time.
+    NearEgo,
+    /// The ego is on a lane of the map at a given time.
+    EgoOnLane,
     /// Lights of crossing approaches are green at the same time.
     ConflictingGreen,
     /// A light changes its colour.
@@ -51,7 +55,7 @@ pub enum Measure {
 
 impl Measure {
     /// All, in the order of tables.
-    pub const ALL: [Self; 19] = [
+    pub const ALL: [Self; 21] = [
         Self::ParkedMove,
         Self::RoadsideMove,
         Self::FreeRoadStop,
@@ -66,6 +70,8 @@ impl Measure {
         Self::Standing,
         Self::ComeToRest,
         Self::Speed,
+        Self::NearEgo,
+        Self::EgoOnLane,
         Self::ConflictingGreen,
         Self::LightChange,
         Self::LightRed,
@@ -90,6 +96,8 @@ impl Measure {
             Self::Standing => "standing",
             Self::ComeToRest => "come_to_rest",
             Self::Speed => "speed_mps",
+            Self::NearEgo => "near_ego",
+            Self::EgoOnLane => "ego_on_lane",
             Self::ConflictingGreen => "conflicting_green",
             Self::LightChange => "light_change",
             Self::LightRed => "light_red",
@@ -113,6 +121,7 @@ impl Measure {
             Self::NewOverlap | Self::Standing => "agent",
             Self::ComeToRest => "vehicle that moves slowly",
             Self::Speed => "agent that did not stand",
+            Self::NearEgo | Self::EgoOnLane => "ego",
             Self::HardAcceleration | Self::SetOff => "minute",
             Self::LightChange => "minute of a light",
             Self::LightRed => "time of a light",
@@ -137,7 +146,10 @@ impl Measure {
 
     /// True if the value is of moments instead of the whole horizon.
     pub fn is_of_moments(self) -> bool {
-        matches!(self, Self::Standing | Self::ComeToRest | Self::Speed)
+        matches!(
+            self,
+            Self::Standing | Self::ComeToRest | Self::Speed | Self::NearEgo | Self::EgoOnLane
+        )
     }
 
     /// True if the value depends on the horizon, so that a shorter log has none.

@@ -20,6 +20,8 @@
 //! | `standing` | over the last second the agent got less than 0.3 m away; at some moments | agent that is there and that the log also sees then |
 //! | `come_to_rest` | a vehicle that drove at 1 to 12 m/s over the last second before the present stands, at the same moments | vehicle that drove so and that the log also sees then |
 //! | `speed_mps` | speed over the last second, m/s, of an agent that did not stand in the present, at the same moments | agent that did not stand and that the log also sees then |
+//! | `near_ego` | an agent is within 100 m of the ego, at the same moments; only [with newcomers](Behaviour::with_newcomers) | ego that is there |
+//! | `ego_on_lane` | the ego is within 5 m of the centre of a lane for cars, at the same moments; likewise | ego that is there, on maps with lanes |
 //! | `conflicting_green` | two lights are green at once whose lanes cross, coming from roads at 45 to 135 degrees | time that the colours of such pairs are known |
 //! | `light_change` | a light that controls a lane of the map, and whose colour is known in the present, changes it | minute that its colour is known |
 //! | `light_red` | such a light is red | time that its colour is known |
@@ -68,6 +70,7 @@ mod overlap;
 pub(crate) mod reach;
 mod road;
 mod standing;
+mod surroundings;
 #[cfg(test)]
 mod tests;
 mod track;
@@ -157,6 +160,7 @@ impl<'a> Behaviour<'a> {
             seen: Seen::default(),
         };
         counter.standing();
+        counter.surroundings();
         counter.stops_and_starts();
         counter.body();
         counter.overlaps();

@@ -579,6 +579,50 @@ fn who_drives_slowly_and_comes_to_rest() {
 }
 
 #[test]
+fn who_is_around_the_ego_is_counted_where_agents_enter_and_leave() {
+    let text = format!(
+        "{ROAD}agent vehicle 1: 60,0 velocity 10,0\nagent vehicle 2: 150,0\n\
+         agent pedestrian 3: 10,8"
+    );
+    let scenario = scenario(&text);
+    // The ego turns away over the grass, and only the others of the log remain.
+    let away = only(&scenario, 0, |pose, t| {
+        let position = pose.position + dvec2(0.0, 3.0 * t);
+        Pose { position, ..pose }
+    });
+    let behaviour = Behaviour::new(&scenario, 8).with_newcomers();
+    let count = |tally: &Tally, measure, class| {
+        [2, 8].map(|seconds| tally.count(measure, class, seconds).rate())
+    };
+    let (log, future) = (behaviour.log().tally, behaviour.of(&away).tally);
+    // In the log, the ego at 20 and 80 m comes to within 100 m of the second.
+    assert_eq!(
+        count(&log, Measure::NearEgo, Class::Vehicle),
+        [Some(1.0), Some(2.0)]
+    );
+    assert_eq!(
+        count(&future, Measure::NearEgo, Class::Vehicle),
+        [Some(1.0), Some(0.0)],
+        "vehicles that the ego leaves behind"
+    );
+    assert_eq!(
+        count(&log, Measure::NearEgo, Class::Pedestrian),
+        [Some(1.0), Some(1.0)]
+    );
+    assert_eq!(
+        count(&log, Measure::EgoOnLane, Class::Vehicle),
+        [Some(1.0), Some(1.0)]
+    );
+    assert_eq!(
+        count(&future, Measure::EgoOnLane, Class::Vehicle),
+        [Some(0.0), Some(0.0)]
+    );
+    let without = Behaviour::new(&scenario, 8).log().tally;
+    let near = without.count(Measure::NearEgo, Class::Vehicle, 8);
+    assert_eq!(near.rate(), None, "{near:?}");
+}
+
+#[test]
 fn crossing_lights_must_not_be_green_at_once() {
     let check = |lights: &str, expected: Option<f64>| {
         let text = format!(

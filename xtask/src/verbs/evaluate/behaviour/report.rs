@@ -23,7 +23,7 @@ const DRAWS: usize = 1000;
 /// A chart: its name, what its axis says, and which measures are on it.
 type Chart = (&'static str, &'static str, fn(Measure) -> bool);
 
-const CHARTS: [Chart; 5] = [
+const CHARTS: [Chart; 6] = [
     (
         "shares",
         "share, or number per agent, with 95 % intervals over scenarios",
@@ -37,12 +37,17 @@ const CHARTS: [Chart; 5] = [
     (
         "standing",
         "share that stands, with 95 % intervals over scenarios",
-        |measure| measure.is_of_moments() && measure != Measure::Speed,
+        |measure| matches!(measure, Measure::Standing | Measure::ComeToRest),
     ),
     (
         "speeds",
         "mean speed of agents that do not stand in the present, m/s, with 95 % intervals over scenarios",
         |measure| measure == Measure::Speed,
+    ),
+    (
+        "around",
+        "agents near the ego, and share of egos on a lane, with 95 % intervals over scenarios",
+        |measure| matches!(measure, Measure::NearEgo | Measure::EgoOnLane),
     ),
     (
         "phases",
@@ -244,6 +249,8 @@ fn chart(label: &str, columns: &[&Column], keys: &[Key], shows: impl Fn(Measure)
         match measure {
             Measure::Standing | Measure::Speed => format!("{class}, {seconds} s"),
             Measure::ComeToRest => format!("{class}, slow, {seconds} s"),
+            Measure::NearEgo => format!("{class}, near, {seconds} s"),
+            Measure::EgoOnLane => format!("ego on a lane, {seconds} s"),
             _ => {
                 let name = measure.name();
                 // The title of the axis has the unit.
