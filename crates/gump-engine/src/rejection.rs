@@ -26,6 +26,8 @@ pub(crate) type Way = [Pose; POSES * PLACES];
 /// An object over an edge by less than this is on the road, metres, and one that is off it counts
 /// as farther off only beyond this: bins and maps are not more precise.
 const SLACK_M: f64 = 0.05;
+/// Objects whose headings differ by less go the same way, radians (30 degrees).
+const ALONGSIDE: f64 = 0.52;
 /// Braking of a vehicle without a clear path, metres per second squared: firm, on a dry road. Not
 /// tuned.
 pub(crate) const BRAKING: f64 = 5.0;
@@ -184,6 +186,15 @@ impl Footprints {
         member.places_on_road(&member.ahead) < member.ahead.len()
     }
 
+    /// Whether an object conflicts with one beside it that goes the same way.
+    pub(crate) fn is_pressed(&self, i: usize) -> bool {
+        let member = &self.members[i];
+        let others = self.members.iter().enumerate();
+        let mut others = others.filter(|(j, other)| *j != i && is_beside(member, other));
+        let conflicts = |other| clear_places(member, &member.ahead, other) < member.ahead.len();
+        !member.is_driven && others.any(|(_, other)| !other.is_ignored && conflicts(other))
+    }
+
     /// Accepts a draw of an object if it stays clear of all others, and on the road, longer than
     /// the present one.
     pub(crate) fn improve(&mut self, i: usize, ahead: &Way) -> bool {
@@ -201,6 +212,17 @@ impl Footprints {
         }
         better
     }
+}
+
+/// Whether two objects were side by side, at least in part, and headed the same way.
+fn is_beside(a: &Member, b: &Member) -> bool {
+    let Some((p, q)) = a.before.zip(b.before) else {
+        return false;
+    };
+    let away = p.inverse() * q.position;
+    angle_difference(p.heading, q.heading).abs() < ALONGSIDE
+        && away.x.abs() < (a.length + b.length) / 2.0
+        && !(a.walks || b.walks)
 }
 
 /// Number of positions before two objects, the first of them on its path `ahead`, overlap; all of

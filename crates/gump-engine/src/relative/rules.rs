@@ -452,8 +452,9 @@ pub struct Driven {
 }
 
 /// Redraws moves that are not clear, up to `redraws` times each; a vehicle that would leave the road
-/// with all of them steers back, and an agent without a clear path brakes. Vehicles may not leave the
-/// road, except where `may_leave` holds for their index.
+/// with all of them steers back, agents that would run into one beside them steer away from it, and an
+/// agent without a clear path brakes. Vehicles may not leave the road, except where `may_leave` holds for
+/// their index.
 pub fn resolve(
     agents: &[Shown],
     driven: Option<Driven>,
@@ -494,16 +495,23 @@ pub fn resolve(
             }
         }
     }
-    for i in crowd.unclear(0).into_iter().filter(|&i| !may_leave(i)) {
+    let mut steer = |crowd: &mut Footprints, i: usize, needs_to: &dyn Fn(&Footprints) -> bool| {
+        let drawn = moves[i];
         for turn in STEERS_RAD {
-            let step = steered(moves[i], turn);
-            if crowd.leaves_road(i)
+            let step = steered(drawn, turn);
+            if needs_to(crowd)
                 && holds(&agents[i], turn)
                 && crowd.improve(i, &ahead(agents[i].pose, step))
             {
                 moves[i] = step;
             }
         }
+    };
+    for i in crowd.unclear(0).into_iter().filter(|&i| !may_leave(i)) {
+        steer(&mut crowd, i, &|crowd| crowd.leaves_road(i));
+    }
+    for i in 0..agents.len() {
+        steer(&mut crowd, i, &|crowd| crowd.is_pressed(i));
     }
     for i in crowd.unclear(0) {
         let Some((step, way)) = braking(&agents[i], moves[i]) else {
@@ -515,8 +523,8 @@ pub fn resolve(
     }
 }
 
-/// Turns within a move that are tried for a vehicle that would leave the road, radians, the slightest
-/// first.
+/// Turns within a move that are tried for a vehicle that would leave the road or run into one beside it,
+/// radians, the slightest first.
 const STEERS_RAD: [f64; 10] = [
     0.04, -0.04, 0.08, -0.08, 0.12, -0.12, 0.16, -0.16, 0.2, -0.2,
 ];
@@ -548,11 +556,14 @@ fn ahead(from: Pose, step: Pose) -> Way {
     way(Some(from), poses)
 }
 
-/// The move of an agent that brakes on its path, and that path.
+/// The move of an agent that brakes on its path, and that path; one that creeps stands.
 fn braking(now: &Shown, step: Pose) -> Option<(Pose, Way)> {
     let (speed, length) = (now.velocity().length(), step.position.length());
-    if speed < CREEPING || length < 1e-6 {
+    if length < 1e-6 {
         return None;
+    }
+    if speed < CREEPING {
+        return Some((Pose::IDENTITY, way(Some(now.pose), [now.pose; POSES])));
     }
     let stop = speed / BRAKING;
     let metres = |t: f64| {
@@ -572,7 +583,7 @@ fn braking(now: &Shown, step: Pose) -> Option<(Pose, Way)> {
 
 #[cfg(test)]
 mod tests {
-    use gump_geometry::DVec2;
+    use gump_geometry::{DVec2, OrientedBox};
     use gump_model::relative::graph::Body;
     use gump_model::relative::route::Traveller;
     use gump_scene::{Seed, fixture};
@@ -658,6 +669,64 @@ mod tests {
         let braked = settled(None)[0].position.x;
         assert!((braked - 3.375).abs() < 1e-9, "{braked}");
         assert_eq!(settled(driven(0, true))[0], straight(4.0));
+    }
+
+    #[test]
+    fn vehicles_side_by_side_keep_off_each_other() {
+        let beside = |y: f64, heading: f64| {
+            let mut other = car(0.0, 5.0);
+            other.pose = Pose::new(-1.0, y, heading);
+            other
+        };
+        let lane_map = LaneMap::default();
+        let settled = |agents: &[Shown], drawn: [Pose; 2]| {
+            let mut moves = drawn;
+            let again = |who: &[usize], _: usize| who.iter().map(|&i| drawn[i]).collect();
+            let edges = (&lane_map, &(|_| false) as &dyn Fn(usize) -> bool);
+            resolve(agents, None, edges, 2, &mut moves, &mut { again });
+            moves
+        };
+        let drifts = Pose::new(5.0, -0.6, -0.05);
+        let agents = [car(0.0, 5.0), beside(2.6, 0.0)];
+        let moves = settled(&agents, [straight(5.0), drifts]);
+        let next: Vec<Shown> = (0..2)
+            .map(|i| agents[i].then(agents[i].pose * moves[i]))
+            .collect();
+        let body = |now: &Shown| OrientedBox {
+            pose: now.pose,
+            length: now.body.length,
+            width: now.body.width,
+        };
+        assert!(!body(&next[0]).overlaps(&body(&next[1])));
+        // Neither brakes for it.
+        let metres = moves.map(|step| step.position.length());
+        assert!(
+            (metres[0] - 5.0).abs() < 1e-9 && (metres[1] - drifts.position.length()).abs() < 1e-9
+        );
+        // Who comes the other way is no neighbour to steer away from.
+        let oncoming = [car(0.0, 5.0), beside(2.6, std::f64::consts::PI)];
+        let met = settled(&oncoming, [straight(5.0), Pose::new(5.0, 0.9, 0.05)]);
+        assert!(
+            met.iter()
+                .all(|step| step.heading == 0.0 || step.heading == 0.05),
+            "{met:?}"
+        );
+    }
+
+    #[test]
+    fn who_creeps_stands_before_it_touches_another() {
+        let agents = [car(0.0, 0.2), car(4.1, 0.0)];
+        let mut moves = [straight(0.2), Pose::IDENTITY];
+        let lane_map = LaneMap::default();
+        resolve(
+            &agents,
+            None,
+            (&lane_map, &|_| false),
+            2,
+            &mut moves,
+            &mut |who, _| who.iter().map(|_| straight(0.2)).collect(),
+        );
+        assert_eq!(moves, [Pose::IDENTITY; 2]);
     }
 
     #[test]

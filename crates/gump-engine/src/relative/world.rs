@@ -910,6 +910,8 @@ impl Future {
             way.is_some_and(|way| way.leaves_street(&agents[i]))
         };
         let edges = (lane_map, &may_leave as &dyn Fn(usize) -> bool);
+        // Who only seems to have set off need not brake to stay.
+        let agents: Vec<Shown> = self.members.iter().map(Member::as_it_moves).collect();
         resolve(&agents, driven, edges, redraws, &mut moves, &mut lawful);
         self.back_up(who_drives, &mut moves);
         moves
@@ -1066,6 +1068,15 @@ impl Member {
 
     fn now(&self) -> Shown {
         self.seen.now()
+    }
+
+    /// As it moves, also where the network is shown that it has set off.
+    fn as_it_moves(&self) -> Shown {
+        let (now, velocity) = (self.now(), self.agent.state.velocity);
+        match self.could_go && now.velocity() != velocity {
+            true => Shown::first(now.body, now.pose, velocity),
+            false => now,
+        }
     }
 
     /// Whether a move is one that the network draws too often, and is drawn once more: a pedestrian who
