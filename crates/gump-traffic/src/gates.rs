@@ -10,7 +10,7 @@
 
 use std::collections::BTreeMap;
 
-use gump_geometry::{DVec2, Polyline, Pose, dvec2};
+use gump_geometry::{DVec2, Polyline, Pose, angle_difference, dvec2};
 use gump_scene::{
     Agent, AgentId, AgentKind, AgentState, BendLimits, Frame, Lane, LaneId, LaneKind, Light,
     LightState, MapGraph, Rng, SceneState, Seed, TYPICAL_SPEED_LIMIT, bend_speed, lanes_ahead,
@@ -414,7 +414,11 @@ fn entering_speed(gate: &Gate, there: &[Agent], length: f64, wanted: f64) -> Opt
             continue;
         }
         let foot = gate.path.project(at);
-        if foot.distance > 1.0 + agent.width / 2.0 && foot.arc_length > 0.0 {
+        // As far as it extends across the path: parked vehicles stand at an angle.
+        let way = gate.path.pose_at(foot.arc_length).heading;
+        let (sin, cos) = angle_difference(agent.state.pose.heading, way).sin_cos();
+        let half = (cos.abs() * agent.width + sin.abs() * agent.length) / 2.0;
+        if foot.distance > 1.0 + half && foot.arc_length > 0.0 {
             continue;
         }
         let gap = foot.arc_length - (length + agent.length) / 2.0;
@@ -584,7 +588,7 @@ fn path_from(map: &MapGraph, lane: &Lane, s: f64) -> Option<Polyline> {
         let turn = |lane: &Lane| {
             let way = &lane.centerline;
             let end = way.pose_at(way.length()).heading;
-            gump_geometry::angle_difference(end, heading).abs()
+            angle_difference(end, heading).abs()
         };
         let next = map.successors(last.id);
         let Some(next) = next.min_by(|a, b| turn(a).total_cmp(&turn(b)).then(a.id.cmp(&b.id)))
@@ -618,6 +622,20 @@ mod tests {
             .filter(|g| (g.kind, g.lane) == (0, LaneId(1)));
         let gate = of_lane.next().expect("lane 1 leads into the window");
         (scenario, gate)
+    }
+
+    #[test]
+    fn nobody_enters_into_a_vehicle_that_is_parked_askew() {
+        // Its centre is 3 m beside the path: along the road there is room, across it is not.
+        let enters = |heading: f64| {
+            let text =
+                format!("lane 1: -200,0 200,0\nagent vehicle 1: -106,3 heading {heading} size 5,2");
+            let (scenario, gate) = entry(&text);
+            let there = scenario.present().now().agents();
+            entering_speed(&gate, there, 4.5, 10.0).is_some()
+        };
+        assert!(enters(0.0));
+        assert!(!enters(0.6));
     }
 
     #[test]
