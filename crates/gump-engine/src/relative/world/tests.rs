@@ -91,6 +91,19 @@ fn without_routes_there_are_none() {
     assert_eq!(future.members[0].intent.route(), None);
 }
 
+#[test]
+fn the_rules_know_that_who_is_shown_to_set_off_still_stands() {
+    let scenario = fixture::scenario("lane 1: -80,0 80,0\nego vehicle 0: 0,0").unwrap();
+    let world = ruled();
+    let (mut future, _) = future(&world, &scenario, 0, 1);
+    let member = &mut future.members[0];
+    member.agent.state.velocity = DVec2::ZERO;
+    member.seen.restart(&world.engine, SETS_OFF);
+    member.could_go = true;
+    assert!((member.now().velocity().length() - SETS_OFF).abs() < 1e-9);
+    assert_eq!(member.as_it_moves().velocity(), DVec2::ZERO);
+}
+
 /// Two lanes that cross in a junction, and on each a vehicle that stands in the way of the other.
 fn stuck() -> Scenario {
     let mut scenario = fixture::scenario(
