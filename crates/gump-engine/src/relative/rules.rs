@@ -495,9 +495,14 @@ pub fn resolve(
             }
         }
     }
-    let mut steer = |crowd: &mut Footprints, i: usize, needs_to: &dyn Fn(&Footprints) -> bool| {
+    let turns: Vec<f64> = moves.iter().map(|step| step.heading).collect();
+    // From no turn back to the road, and within its own turn away from others.
+    let mut steer = |crowd: &mut Footprints,
+                     (i, from): (usize, f64),
+                     needs_to: &dyn Fn(&Footprints) -> bool| {
         let drawn = moves[i];
         for turn in STEERS_RAD {
+            let turn = from + turn;
             let step = steered(drawn, turn);
             if needs_to(crowd)
                 && holds(&agents[i], turn)
@@ -508,12 +513,17 @@ pub fn resolve(
         }
     };
     for i in crowd.unclear(0).into_iter().filter(|&i| !may_leave(i)) {
-        steer(&mut crowd, i, &|crowd| crowd.leaves_road(i));
+        steer(&mut crowd, (i, 0.0), &|crowd| crowd.leaves_road(i));
     }
-    for i in 0..agents.len() {
-        steer(&mut crowd, i, &|crowd| crowd.is_pressed(i));
+    for (i, turn) in turns.into_iter().enumerate() {
+        steer(&mut crowd, (i, turn), &|crowd| crowd.is_pressed(i));
     }
     for i in crowd.unclear(0) {
+        // One that stands before the road's edge would stand there for ever, in the way of others.
+        let stands = agents[i].velocity().length() < CREEPING;
+        if stands && crowd.leaves_road(i) {
+            continue;
+        }
         let Some((step, way)) = braking(&agents[i], moves[i]) else {
             continue;
         };
@@ -523,8 +533,8 @@ pub fn resolve(
     }
 }
 
-/// Turns within a move that are tried for a vehicle that would leave the road or run into one beside it,
-/// radians, the slightest first.
+/// Turns within a move that are tried for a vehicle that would leave the road, or added to that of an agent
+/// that would run into one beside it, radians, the slightest first.
 const STEERS_RAD: [f64; 10] = [
     0.04, -0.04, 0.08, -0.08, 0.12, -0.12, 0.16, -0.16, 0.2, -0.2,
 ];
@@ -703,6 +713,10 @@ mod tests {
         assert!(
             (metres[0] - 5.0).abs() < 1e-9 && (metres[1] - drifts.position.length()).abs() < 1e-9
         );
+        // Who turns turns less.
+        let turns = Pose::new(4.0, -0.6, -0.2);
+        let turned = settled(&agents, [straight(5.0), turns])[1].heading;
+        assert!((-0.17..-0.1).contains(&turned), "{turned}");
         // Who comes the other way is no neighbour to steer away from.
         let oncoming = [car(0.0, 5.0), beside(2.6, std::f64::consts::PI)];
         let met = settled(&oncoming, [straight(5.0), Pose::new(5.0, 0.9, 0.05)]);
