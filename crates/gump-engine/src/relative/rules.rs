@@ -24,7 +24,7 @@ use crate::relative::turning_in::TakesWay;
 
 // The thresholds are chosen by hand; none has been varied in a measurement.
 
-/// A slower vehicle is not braked, and one that braking makes slower stands, metres per second: a
+/// A slower agent is not braked but stands, as does one that braking makes slower, metres per second: a
 /// quarter of a metre in a step.
 const CREEPING: f64 = 0.5;
 /// Lines of one junction lie within this, metres: those of neighbouring lanes may be staggered.

@@ -139,7 +139,7 @@ impl Measure {
     }
 
     /// True if the value is a mean duration in seconds. What is neither a rate nor a duration nor
-    /// [`Measure::Speed`] is a share or a number per agent.
+    /// [`Measure::Speed`] is a share or a number per agent or ego.
     pub fn is_duration(self) -> bool {
         matches!(self, Self::RedPhase | Self::GreenPhase)
     }

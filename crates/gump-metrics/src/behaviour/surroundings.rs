@@ -12,8 +12,8 @@ const NEAR_M: f64 = 100.0;
 const ON_MAP_M: f64 = 5.0;
 
 impl Counter<'_> {
-    /// The share of agents per ego, and of egos on a lane. Without newcomers the number of agents
-    /// says where they drive, not how dense traffic is.
+    /// Counts the agents near the ego, and whether it is on a lane. Without newcomers the number of
+    /// agents says where those of the present have gone, not how dense traffic is.
     pub(super) fn surroundings(&mut self) {
         if !self.behaviour.newcomers {
             return;
