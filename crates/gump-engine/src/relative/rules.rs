@@ -681,6 +681,15 @@ mod tests {
         assert_eq!(settled(driven(0, true))[0], straight(4.0));
     }
 
+    /// The moves of two agents on an open place, whose draws are all the same.
+    fn redrawn_alike(agents: &[Shown], drawn: [Pose; 2]) -> [Pose; 2] {
+        let (mut moves, lane_map) = (drawn, LaneMap::default());
+        let mut again = |who: &[usize], _: usize| who.iter().map(|&i| drawn[i]).collect();
+        let edges = (&lane_map, &(|_| false) as &dyn Fn(usize) -> bool);
+        resolve(agents, None, edges, 2, &mut moves, &mut again);
+        moves
+    }
+
     #[test]
     fn vehicles_side_by_side_keep_off_each_other() {
         let beside = |y: f64, heading: f64| {
@@ -688,17 +697,9 @@ mod tests {
             other.pose = Pose::new(-1.0, y, heading);
             other
         };
-        let lane_map = LaneMap::default();
-        let settled = |agents: &[Shown], drawn: [Pose; 2]| {
-            let mut moves = drawn;
-            let again = |who: &[usize], _: usize| who.iter().map(|&i| drawn[i]).collect();
-            let edges = (&lane_map, &(|_| false) as &dyn Fn(usize) -> bool);
-            resolve(agents, None, edges, 2, &mut moves, &mut { again });
-            moves
-        };
         let drifts = Pose::new(5.0, -0.6, -0.05);
         let agents = [car(0.0, 5.0), beside(2.6, 0.0)];
-        let moves = settled(&agents, [straight(5.0), drifts]);
+        let moves = redrawn_alike(&agents, [straight(5.0), drifts]);
         let next: Vec<Shown> = (0..2)
             .map(|i| agents[i].then(agents[i].pose * moves[i]))
             .collect();
@@ -715,11 +716,11 @@ mod tests {
         );
         // Who turns turns less.
         let turns = Pose::new(4.0, -0.6, -0.2);
-        let turned = settled(&agents, [straight(5.0), turns])[1].heading;
+        let turned = redrawn_alike(&agents, [straight(5.0), turns])[1].heading;
         assert!((-0.17..-0.1).contains(&turned), "{turned}");
         // Who comes the other way is no neighbour to steer away from.
         let oncoming = [car(0.0, 5.0), beside(2.6, std::f64::consts::PI)];
-        let met = settled(&oncoming, [straight(5.0), Pose::new(5.0, 0.9, 0.05)]);
+        let met = redrawn_alike(&oncoming, [straight(5.0), Pose::new(5.0, 0.9, 0.05)]);
         assert!(
             met.iter()
                 .all(|step| step.heading == 0.0 || step.heading == 0.05),
@@ -730,16 +731,7 @@ mod tests {
     #[test]
     fn who_creeps_stands_before_it_touches_another() {
         let agents = [car(0.0, 0.2), car(4.1, 0.0)];
-        let mut moves = [straight(0.2), Pose::IDENTITY];
-        let lane_map = LaneMap::default();
-        resolve(
-            &agents,
-            None,
-            (&lane_map, &|_| false),
-            2,
-            &mut moves,
-            &mut |who, _| who.iter().map(|_| straight(0.2)).collect(),
-        );
+        let moves = redrawn_alike(&agents, [straight(0.2), Pose::IDENTITY]);
         assert_eq!(moves, [Pose::IDENTITY; 2]);
     }
 
