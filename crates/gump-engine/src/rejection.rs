@@ -186,13 +186,30 @@ impl Footprints {
         member.places_on_road(&member.ahead) < member.ahead.len()
     }
 
+    /// Whether an object conflicts with another one.
+    pub(crate) fn meets_another(&self, i: usize) -> bool {
+        let mut others = self.others(i);
+        others.any(|other| self.conflict(i, other))
+    }
+
     /// Whether an object conflicts with one beside it that goes the same way.
     pub(crate) fn is_pressed(&self, i: usize) -> bool {
         let member = &self.members[i];
+        let beside = |other: &&Member| is_beside(member, other);
+        let mut beside = self.others(i).filter(beside);
+        !member.is_driven && beside.any(|other| self.conflict(i, other))
+    }
+
+    /// Those that an object keeps clear of.
+    fn others(&self, i: usize) -> impl Iterator<Item = &Member> {
         let others = self.members.iter().enumerate();
-        let mut others = others.filter(|(j, other)| *j != i && is_beside(member, other));
-        let conflicts = |other| clear_places(member, &member.ahead, other) < member.ahead.len();
-        !member.is_driven && others.any(|(_, other)| !other.is_ignored && conflicts(other))
+        let others = others.filter(move |(j, other)| *j != i && !other.is_ignored);
+        others.map(|(_, other)| other)
+    }
+
+    fn conflict(&self, i: usize, other: &Member) -> bool {
+        let member = &self.members[i];
+        clear_places(member, &member.ahead, other) < member.ahead.len()
     }
 
     /// Accepts a draw of an object if it stays clear of all others, and on the road, longer than
@@ -200,9 +217,9 @@ impl Footprints {
     pub(crate) fn improve(&mut self, i: usize, ahead: &Way) -> bool {
         let member = &self.members[i];
         let clear = |ahead: &Way| {
-            let others = self.members.iter().enumerate();
-            let others = others.filter(|(j, other)| *j != i && !other.is_ignored);
-            let clear = others.map(|(_, other)| clear_places(member, ahead, other));
+            let clear = self
+                .others(i)
+                .map(|other| clear_places(member, ahead, other));
             let on_road = member.places_on_road(ahead);
             clear.fold(on_road, usize::min)
         };

@@ -430,9 +430,9 @@ pub(super) const STARTS: usize = 1 << 10;
 pub(super) const HALTS: usize = STARTS + 1;
 pub(super) const RESOLVES: usize = 1 << 11;
 
-/// Draws the moves of these agents once more, whatever comes: of those that stand although nothing holds
-/// them, and those that come to a halt or set off without need. More draws would dissolve all queues
-/// that recorded and simulated logs show (result 23).
+/// Draws the moves of these agents once more, whatever comes: of those that stand or slow down although
+/// nothing holds them, and those that come to a halt or set off without need. More draws would dissolve all
+/// queues that recorded and simulated logs show (result 23).
 pub(super) fn draw_again(who: &[usize], attempt: usize, moves: &mut [Pose], again: &mut Again<'_>) {
     if who.is_empty() {
         return;
@@ -519,9 +519,10 @@ pub fn resolve(
         steer(&mut crowd, (i, turn), &|crowd| crowd.is_pressed(i));
     }
     for i in crowd.unclear(0) {
-        // One that stands before the road's edge would stand there for ever, in the way of others.
+        // One that stands before the road's edge would stand there for ever, in the way of others, if only
+        // the edge held it.
         let stands = agents[i].velocity().length() < CREEPING;
-        if stands && crowd.leaves_road(i) {
+        if stands && crowd.leaves_road(i) && !crowd.meets_another(i) {
             continue;
         }
         let Some((step, way)) = braking(&agents[i], moves[i]) else {
@@ -733,6 +734,29 @@ mod tests {
         let agents = [car(0.0, 0.2), car(4.1, 0.0)];
         let moves = redrawn_alike(&agents, [straight(0.2), Pose::IDENTITY]);
         assert_eq!(moves, [Pose::IDENTITY; 2]);
+    }
+
+    #[test]
+    fn who_stands_before_the_road_s_edge_is_held_by_others_alone() {
+        let map = fixture::scenario(
+            "lane 1: -50,0 0,0
+             edge: 2.6,-30 2.6,30
+             ego vehicle 0: 0,0",
+        )
+        .unwrap()
+        .map;
+        let lane_map = LaneMap::of_edges(&map, &[DVec2::ZERO], 50.0);
+        let edges = (&lane_map, &(|_| false) as &dyn Fn(usize) -> bool);
+        let moved = |beyond: f64| {
+            let agents = [car(0.0, 0.0), car(beyond, 0.0)];
+            let mut moves = [straight(1.0), Pose::IDENTITY];
+            resolve(&agents, None, edges, 1, &mut moves, &mut |who, _| {
+                vec![straight(1.0); who.len()]
+            });
+            moves[0]
+        };
+        assert_eq!(moved(40.0), straight(1.0));
+        assert_eq!(moved(5.0), Pose::IDENTITY);
     }
 
     #[test]

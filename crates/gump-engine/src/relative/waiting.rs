@@ -16,12 +16,11 @@
 //!   other two a single light that is not green is a reason.
 //! * Stop signs, junctions and the end of the road do not hold. Whoever stopped for them has stopped
 //!   for long enough; at a junction only traffic that is about to cross holds.
-//! * Agents hold within 5 m, the free path that a start needs; in the other two within 12 and 15 m,
-//!   so that all of a queue has a reason.
+//! * Agents hold within 5 m, the free path that a start needs, and vehicles that roll within 12 m; in the
+//!   other two within 12 and 15 m, so that all of a queue has a reason.
 //! * Bicycles, and agents that were seen to drive, count as in a lane farther from its centre.
 //!
-//! Vehicles that are about to stop for nothing are found by the same question, and people whom a vehicle
-//! waits for.
+//! Vehicles that slow down for nothing are found by the same question, and people whom a vehicle waits for.
 
 use std::f64::consts::FRAC_PI_2;
 
@@ -61,6 +60,11 @@ const USUAL: Room = Room {
     beside_m: 0.3,
     returns: true,
     insists: false,
+};
+/// The room that others must leave for one that rolls to have no reason to slow down.
+const ROLLING: Room = Room {
+    ahead_m: 12.0,
+    ..USUAL
 };
 /// The room that suffices for agents that hold each other.
 const TIGHT: Room = Room {
@@ -147,7 +151,7 @@ struct Room {
 pub(super) struct Released {
     /// They could go on.
     pub(super) go: Vec<usize>,
-    /// Vehicles that roll slowly, and have nothing to stop for.
+    /// Vehicles that roll slowly, and have nothing to slow down for.
     pub(super) roll: Vec<usize>,
     /// They stand in the way of others in a junction, as these in theirs, and have room to back up; with
     /// each these others.
@@ -166,7 +170,7 @@ pub(super) struct Released {
 /// A pedestrian could if it stands on the path of a vehicle or bicycle that has waited as long.
 /// `agents` are all of the frame; the lights of the lanes `fresh` have just changed. If it `is_late`, those
 /// clear a junction whose light has changed, those who were seen to drive start sooner, people walk on before
-/// vehicles sooner, and vehicles that roll without a reason to stop are returned as well.
+/// vehicles sooner, and vehicles that roll without a reason to slow down are returned as well.
 pub(super) fn released(
     map: &MapGraph,
     lights: &[Light],
@@ -246,7 +250,7 @@ pub(super) fn released(
         let is_held = || {
             let others = agents.iter().enumerate().filter(|(j, _)| j != i);
             let mut others = others.map(|(j, other)| (waits(&j), &other.agent));
-            others.any(|(stays, other)| holds(&reached, agent, other, stays, &USUAL))
+            others.any(|(stays, other)| holds(&reached, agent, other, stays, &ROLLING))
         };
         let is_signed = || reached.iter().any(|part| has_sign(map, part.lane));
         !reached.is_empty() && !is_shut(&reached, lights, agent) && !is_signed() && !is_held()

@@ -67,6 +67,9 @@ const PATIENCE_S: [f64; 2] = [9.0, 27.0];
 /// A slower agent loses its patience, too, metres per second: who stands in another's way creeps by
 /// centimetres now and then, and waits no less.
 const CREEPS: f64 = 0.5;
+/// One that rolls without a reason to slow down, and is to be slower by more than this after a step, is
+/// drawn once more, metres per second. Chosen by hand.
+const DAWDLES_MPS: f64 = 0.2;
 /// Who goes on and stops again within this has still waited, metres: it came up to the line.
 const NO_FARTHER_M: f64 = 5.0;
 /// The speed of a restarted agent, metres per second. With 2 m/s vehicles start more often than in the
@@ -409,8 +412,10 @@ struct Member {
     idle_at: DVec2,
     /// Whether it was faster than [`DRIVES`] in a frame since.
     has_driven: bool,
-    /// Whether it stands in a lane, or rolls slowly, although nothing holds it.
+    /// Whether it stands in a lane although nothing holds it.
     could_go: bool,
+    /// Whether it rolls slowly on a lane although nothing holds it.
+    could_roll: bool,
     /// Steps for which it backs up for others, and waits afterwards.
     backing: usize,
     /// Steps for which it does not wait again where it could go: another has backed up for it, or it has
@@ -723,6 +728,7 @@ impl Future {
         let mut is_one_idle = is_late;
         for member in &mut self.members {
             member.could_go = false;
+            member.could_roll = false;
             member.backing = member.backing.saturating_sub(1);
             member.let_pass = member.let_pass.saturating_sub(1);
             member.insists = match is_due(member.idle, patience_s(self.seed, member.agent.id)) {
@@ -775,7 +781,7 @@ impl Future {
                 member.seen.turn_to(heading);
             }
             for i in released.roll {
-                self.members[i].could_go = true;
+                self.members[i].could_roll = true;
             }
             for i in released.go {
                 let member = &mut self.members[i];
@@ -841,12 +847,14 @@ impl Future {
         };
         let (lane_map, redraws) = (&self.scene.lane_map, sampling.redraws);
         let driven = driven.map(|(i, _)| i);
-        let stays = |i: &usize| {
-            let could_go = self.members[*i].could_go && driven != Some(*i);
-            could_go && moves[*i].position == DVec2::ZERO
+        let dawdles = |i: &usize| {
+            let (member, metres) = (&self.members[*i], moves[*i].position.length());
+            let slower = agents[*i].velocity().length() - DAWDLES_MPS;
+            let stays = member.could_go && metres == 0.0;
+            driven != Some(*i) && (stays || member.could_roll && metres < TOKEN_DT * slower)
         };
-        let standing: Vec<usize> = (0..agents.len()).filter(stays).collect();
-        draw_again(&standing, STARTS, &mut moves, &mut again);
+        let dawdling: Vec<usize> = (0..agents.len()).filter(dawdles).collect();
+        draw_again(&dawdling, STARTS, &mut moves, &mut again);
         let is_rare = |i: &usize| {
             let member = &self.members[*i];
             driven != Some(*i) && member.is_rare(&self.scene.source, moves[*i], streams[*i])
@@ -1059,6 +1067,7 @@ impl Member {
             idle_at: state.pose.position,
             has_driven: state.speed() > DRIVES,
             could_go: false,
+            could_roll: false,
             backing: 0,
             let_pass: 0,
             insists: 0,
