@@ -13,6 +13,8 @@
 #[cfg(test)]
 mod tests;
 
+use std::f64::consts::PI;
+
 use gump_geometry::{OrientedBox, Pose, angle_difference};
 use gump_model::local_context::{Edge, LaneMap, metres_across, metres_off};
 
@@ -28,6 +30,11 @@ pub(crate) type Way = [Pose; POSES * PLACES];
 const SLACK_M: f64 = 0.05;
 /// Objects whose headings differ by less go the same way, radians (30 degrees).
 const ALONGSIDE: f64 = 0.52;
+/// One comes by another if it heads within this angle of the opposite way, radians, is this far before it
+/// at most, and this far on its left at least, metres. Chosen by hand.
+const OPPOSITE: f64 = 0.35;
+const COMES_BY_M: f64 = 25.0;
+const BY_M: f64 = 0.3;
 /// Braking of a vehicle without a clear path, metres per second squared: firm, on a dry road. Not
 /// tuned.
 pub(crate) const BRAKING: f64 = 5.0;
@@ -192,10 +199,11 @@ impl Footprints {
         others.any(|other| self.conflict(i, other))
     }
 
-    /// Whether an object conflicts with one beside it that goes the same way.
+    /// Whether an object conflicts with one beside it that goes the same way, or one that is about to come
+    /// by on its left.
     pub(crate) fn is_pressed(&self, i: usize) -> bool {
         let member = &self.members[i];
-        let beside = |other: &&Member| is_beside(member, other);
+        let beside = |other: &&Member| is_beside(member, other) || comes_by(member, other);
         let mut beside = self.others(i).filter(beside);
         !member.is_driven && beside.any(|other| self.conflict(i, other))
     }
@@ -239,6 +247,19 @@ fn is_beside(a: &Member, b: &Member) -> bool {
     let away = p.inverse() * q.position;
     angle_difference(p.heading, q.heading).abs() < ALONGSIDE
         && away.x.abs() < (a.length + b.length) / 2.0
+        && !(a.walks || b.walks)
+}
+
+/// Whether the second of two objects is about to come by the first one, on whose left it is.
+fn comes_by(a: &Member, b: &Member) -> bool {
+    let Some((p, q)) = a.before.zip(b.before) else {
+        return false;
+    };
+    let away = p.inverse() * q.position;
+    let turn = angle_difference(p.heading, q.heading).abs();
+    turn > PI - OPPOSITE
+        && (0.0..COMES_BY_M).contains(&away.x)
+        && away.y > BY_M
         && !(a.walks || b.walks)
 }
 

@@ -719,7 +719,7 @@ mod tests {
         let turns = Pose::new(4.0, -0.6, -0.2);
         let turned = redrawn_alike(&agents, [straight(5.0), turns])[1].heading;
         assert!((-0.17..-0.1).contains(&turned), "{turned}");
-        // Who comes the other way is no neighbour to steer away from.
+        // Who has come by the other way is no neighbour to steer away from.
         let oncoming = [car(0.0, 5.0), beside(2.6, std::f64::consts::PI)];
         let met = redrawn_alike(&oncoming, [straight(5.0), Pose::new(5.0, 0.9, 0.05)]);
         assert!(
@@ -727,6 +727,26 @@ mod tests {
                 .all(|step| step.heading == 0.0 || step.heading == 0.05),
             "{met:?}"
         );
+    }
+
+    #[test]
+    fn oncoming_vehicles_pass_each_other_on_the_right() {
+        let oncoming = |y: f64| {
+            let mut other = car(0.0, 3.0);
+            other.pose = Pose::new(14.0, y, std::f64::consts::PI);
+            [car(0.0, 3.0), other]
+        };
+        // The bodies are two metres wide: one of them keeps to the right, and neither brakes.
+        let moves = redrawn_alike(&oncoming(1.8), [straight(3.0); 2]);
+        let keeps_pace = |step: &Pose| (step.position.length() - 3.0).abs() < 1e-9;
+        assert!(moves.iter().all(keeps_pace), "{moves:?}");
+        assert!(moves.iter().all(|step| step.heading <= 0.0), "{moves:?}");
+        assert!(moves.iter().any(|step| step.heading < 0.0), "{moves:?}");
+        // On the wrong side they brake.
+        let moves = redrawn_alike(&oncoming(-1.8), [straight(3.0); 2]);
+        let is_slower = |step: &Pose| step.position.length() < 3.0;
+        assert!(moves.iter().any(is_slower), "{moves:?}");
+        assert!(moves.iter().all(|step| step.heading == 0.0), "{moves:?}");
     }
 
     #[test]

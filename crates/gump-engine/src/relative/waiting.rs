@@ -119,6 +119,8 @@ const ROLLS_MPS: f64 = 4.0;
 /// radians.
 const MEETING_M: f64 = 25.0;
 const CROSSES: f64 = 0.52;
+/// Who meets another at more than this angle comes the other way, radians.
+const OPPOSITE: f64 = 2.6;
 
 /// An agent of a frame, and what is known of its past.
 #[derive(Clone, Copy, Debug)]
@@ -153,12 +155,22 @@ pub(super) struct Released {
     pub(super) go: Vec<usize>,
     /// Vehicles that roll slowly, and have nothing to slow down for.
     pub(super) roll: Vec<usize>,
-    /// They stand in the way of others in a junction, as these in theirs, and have room to back up; with
-    /// each these others.
-    pub(super) back_up: Vec<(usize, Vec<usize>)>,
+    /// They stand in the way of others, as these in theirs, and have room to back up.
+    pub(super) back_up: Vec<BackUp>,
     /// People who stand before a vehicle for so long that they turn away to one of its sides, with their new
     /// heading, radians.
     pub(super) aside: Vec<(usize, f64)>,
+}
+
+/// A vehicle that backs up.
+#[derive(Clone, Debug)]
+pub(super) struct BackUp {
+    /// Its index.
+    pub(super) who: usize,
+    /// Those that it stands in the way of.
+    pub(super) blocks: Vec<usize>,
+    /// Whether these are on another lane of a road: to pass it they have to swerve.
+    pub(super) is_on_road: bool,
 }
 
 /// Returns the agents that have stood for longer than their patience and could go on, or back up.
@@ -166,7 +178,8 @@ pub(super) struct Released {
 /// A vehicle or bicycle in a lane could if no agent is on the path ahead or about to cross it, no
 /// light forbids it, and of those whose paths meet there it has waited longest. After twice the time,
 /// in a junction at once, less room suffices between vehicles that stand across each other's paths.
-/// In a junction, where even that is missing for [`STUCK_S`], the vehicle that came last backs up.
+/// In a junction, and if it `is_late` where oncoming vehicles block each other, the vehicle that came last
+/// backs up where even that is missing for [`STUCK_S`].
 /// A pedestrian could if it stands on the path of a vehicle or bicycle that has waited as long.
 /// `agents` are all of the frame; the lights of the lanes `fresh` have just changed. If it `is_late`, those
 /// clear a junction whose light has changed, those who were seen to drive start sooner, people walk on before
@@ -221,11 +234,10 @@ pub(super) fn released(
         };
         if !is_shut(&reached, lights, agent) && (holding.is_empty() || squeezes()) {
             free.push((i, reached));
-        } else if inside[i]
-            && holding
-                .iter()
-                .any(|j| stands_across(agent, &agents[*j].agent))
-        {
+        } else if holding.iter().any(|&j| {
+            let is_across = || stands_across(agent, &agents[j].agent);
+            inside[i] && is_across() || is_late && faces(&agents[i], &agents[j])
+        }) {
             stuck.push(i);
         }
     }
@@ -339,9 +351,20 @@ fn stands_across(agent: &Agent, other: &Agent) -> bool {
     drives && other.state.speed() < MOVES && turn.abs() > CROSSES
 }
 
-/// Those that back up, of the agents that are held in a junction by others that stand across their path:
-/// the vehicle that came last of those that have room behind and stand in the way of another themselves.
-fn backing(map: &MapGraph, agents: &[Standing<'_>], stuck: &[usize]) -> Vec<(usize, Vec<usize>)> {
+/// Whether another vehicle that was seen to drive has stood for long, and comes the other way.
+fn faces(one: &Standing<'_>, other: &Standing<'_>) -> bool {
+    let (agent, its) = (&one.agent, &other.agent);
+    let turn = angle_difference(agent.state.pose.heading, its.state.pose.heading);
+    its.kind == AgentKind::Vehicle
+        && other.has_driven
+        && other.waited_s > STUCK_S
+        && turn.abs() > OPPOSITE
+}
+
+/// Those that back up, of the agents that are held by others that stand across their path in a junction, or
+/// come the other way: the vehicle that came last of those that have room behind and stand in the way of
+/// another themselves.
+fn backing(map: &MapGraph, agents: &[Standing<'_>], stuck: &[usize]) -> Vec<BackUp> {
     let apart = |one: &Agent, other: &Agent| {
         let (from, to) = (one.state.pose.position, other.state.pose.position);
         from.distance(to)
@@ -354,9 +377,9 @@ fn backing(map: &MapGraph, agents: &[Standing<'_>], stuck: &[usize]) -> Vec<(usi
         };
         let others = agents.iter().enumerate();
         let others = others.filter(|(_, other)| {
+            let is_across = || stands_across(agent, &other.agent) && is_inside(map, other);
             apart(agent, &other.agent) < MEETING_M
-                && stands_across(agent, &other.agent)
-                && is_inside(map, other)
+                && (is_across() || faces(&agents[i], other))
                 && is_blocked(other)
         });
         others.map(|(j, _)| j).collect()
@@ -369,14 +392,22 @@ fn backing(map: &MapGraph, agents: &[Standing<'_>], stuck: &[usize]) -> Vec<(usi
             && has_room_behind(&one.agent, all)
     };
     let could = stuck.iter().copied().filter(|&i| could(i));
-    let could = could.map(|i| (i, blocked(i)));
-    let could: Vec<_> = could.filter(|(_, others)| !others.is_empty()).collect();
+    let could = could.map(|who| BackUp {
+        who,
+        blocks: blocked(who),
+        is_on_road: !is_inside(map, &agents[who]),
+    });
+    let could: Vec<_> = could.filter(|one| !one.blocks.is_empty()).collect();
     let is_last = |i: usize| {
         let near = |j: usize| apart(&agents[j].agent, &agents[i].agent) < MEETING_M;
-        let mut others = could.iter().filter(|(j, _)| near(*j));
-        !others.any(|(j, _)| came_later(&agents[*j], &agents[i]))
+        let mut others = could.iter().filter(|other| near(other.who));
+        !others.any(|other| came_later(&agents[other.who], &agents[i]))
     };
-    could.iter().filter(|(i, _)| is_last(*i)).cloned().collect()
+    could
+        .iter()
+        .filter(|one| is_last(one.who))
+        .cloned()
+        .collect()
 }
 
 /// Whether nobody is behind an agent, or about to come there.
@@ -981,7 +1012,7 @@ mod tests {
             let released = released(&MapGraph::new(parts).unwrap(), &[], &[], &agents, false);
             assert!(released.go.is_empty(), "{released:?}");
             let back_up = released.back_up.iter();
-            back_up.map(|(i, _)| *i).collect::<Vec<_>>()
+            back_up.map(|one| one.who).collect::<Vec<_>>()
         };
         assert_eq!(back("", [13.0, 20.0], true), [0]);
         assert_eq!(back("", [20.0, 13.0], true), [1]);
@@ -994,5 +1025,38 @@ mod tests {
         assert_eq!(back(coming, [13.0, 20.0], true), [1]);
         let far = "agent vehicle 2: 12,0";
         assert_eq!(back(far, [13.0, 20.0], true), [0]);
+    }
+
+    #[test]
+    fn of_oncoming_vehicles_that_block_each_other_the_last_one_backs_up() {
+        let back = |waited: [f64; 2], is_parked: bool, is_late: bool| {
+            // On a road that is too narrow for two.
+            let scenario = scenario(
+                "lane 1: 0,0 60,0\nlane 2: 60,2.4 0,2.4\n\
+                 ego vehicle 0: 27,0.5\nagent vehicle 1: 33,1.9 heading 3.1416",
+            );
+            let standing = |agent: &Agent| Standing {
+                agent: *agent,
+                waited_s: waited[agent.id.0 as usize],
+                patience_s: 20.0,
+                has_driven: !(is_parked && agent.id.0 == 1),
+                route: None,
+            };
+            let scene = scenario.present();
+            let agents: Vec<_> = scene.now().agents().iter().map(standing).collect();
+            let released = released(scene.map, &[], &[], &agents, is_late);
+            let back_up = released
+                .back_up
+                .iter()
+                .inspect(|one| assert!(one.is_on_road));
+            back_up
+                .map(|one| (one.who, one.blocks.clone()))
+                .collect::<Vec<_>>()
+        };
+        assert_eq!(back([13.0, 20.0], false, true), [(0, vec![1])]);
+        assert_eq!(back([20.0, 13.0], false, true), [(1, vec![0])]);
+        assert!(back([13.0, 11.0], false, true).is_empty());
+        assert!(back([13.0, 20.0], true, true).is_empty());
+        assert!(back([13.0, 20.0], false, false).is_empty());
     }
 }

@@ -87,6 +87,9 @@ const LATE: usize = 18;
 /// do, and time for the other to pass. Chosen by hand (decision 35).
 const BACK_M: f64 = 0.5;
 const BACKS_UP: usize = 4;
+/// Who blocks an oncoming vehicle on a road backs up for so many steps, five metres: the other has to
+/// swerve. Chosen by hand.
+const BACKS_ON_ROAD: usize = 10;
 const WAITS_BACK: usize = 14;
 /// Who goes on and stops again within so many steps has still waited for ten seconds: in a junction it
 /// goes on at once, where it would creep through two phases of the lights. Chosen by hand (decision 35).
@@ -766,11 +769,16 @@ impl Future {
             let fresh: Vec<_> = fresh.collect();
             let released = released(map, &self.lights, &fresh, &all, is_late);
             let backs_up = released.back_up.into_iter();
-            for (i, blocked) in backs_up.filter(|_| self.scene.has_rules) {
-                self.members[i].backing = BACKS_UP + WAITS_BACK;
-                for j in blocked {
+            for one in backs_up.filter(|_| self.scene.has_rules) {
+                let steps = WAITS_BACK
+                    + match one.is_on_road {
+                        true => BACKS_ON_ROAD,
+                        false => BACKS_UP,
+                    };
+                self.members[one.who].backing = steps;
+                for j in one.blocks {
                     if let Some(member) = self.members.get_mut(j) {
-                        member.let_pass = BACKS_UP + WAITS_BACK;
+                        member.let_pass = steps;
                     }
                 }
             }
