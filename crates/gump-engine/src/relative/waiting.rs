@@ -101,6 +101,8 @@ const PASSES_M: f64 = 0.5;
 const HOPS: usize = 4;
 /// One that does not squeeze past by then backs up, seconds, ...
 const STUCK_S: f64 = 12.0;
+/// ... on a road, where an oncoming vehicle has stood before it for so long, sooner, ...
+const OPPOSED_S: f64 = 4.0;
 /// ... if there is so much room behind it, and so much beside that, metres.
 const BEHIND_M: f64 = 3.0;
 const BESIDE_IT_M: f64 = 0.3;
@@ -179,7 +181,7 @@ pub(super) struct BackUp {
 /// light forbids it, and of those whose paths meet there it has waited longest. After twice the time,
 /// in a junction at once, less room suffices between vehicles that stand across each other's paths.
 /// In a junction, and if it `is_late` where oncoming vehicles block each other, the vehicle that came last
-/// backs up where even that is missing for [`STUCK_S`].
+/// backs up where even that is missing for [`STUCK_S`], or for [`OPPOSED_S`] on a road.
 /// A pedestrian could if it stands on the path of a vehicle or bicycle that has waited as long.
 /// `agents` are all of the frame; the lights of the lanes `fresh` have just changed. If it `is_late`, those
 /// clear a junction whose light has changed, those who were seen to drive start sooner, people walk on before
@@ -236,7 +238,7 @@ pub(super) fn released(
             free.push((i, reached));
         } else if holding.iter().any(|&j| {
             let is_across = || stands_across(agent, &agents[j].agent);
-            inside[i] && is_across() || is_late && faces(&agents[i], &agents[j])
+            inside[i] && is_across() || is_late && faces(map, &agents[i], &agents[j])
         }) {
             stuck.push(i);
         }
@@ -351,13 +353,21 @@ fn stands_across(agent: &Agent, other: &Agent) -> bool {
     drives && other.state.speed() < MOVES && turn.abs() > CROSSES
 }
 
+/// Time after which a vehicle that others hold backs up, seconds.
+fn backs_up_after(map: &MapGraph, one: &Standing<'_>) -> f64 {
+    match is_inside(map, one) {
+        true => STUCK_S,
+        false => OPPOSED_S,
+    }
+}
+
 /// Whether another vehicle that was seen to drive has stood for long, and comes the other way.
-fn faces(one: &Standing<'_>, other: &Standing<'_>) -> bool {
+fn faces(map: &MapGraph, one: &Standing<'_>, other: &Standing<'_>) -> bool {
     let (agent, its) = (&one.agent, &other.agent);
     let turn = angle_difference(agent.state.pose.heading, its.state.pose.heading);
     its.kind == AgentKind::Vehicle
         && other.has_driven
-        && other.waited_s > STUCK_S
+        && other.waited_s > backs_up_after(map, other)
         && turn.abs() > OPPOSITE
 }
 
@@ -379,7 +389,7 @@ fn backing(map: &MapGraph, agents: &[Standing<'_>], stuck: &[usize]) -> Vec<Back
         let others = others.filter(|(_, other)| {
             let is_across = || stands_across(agent, &other.agent) && is_inside(map, other);
             apart(agent, &other.agent) < MEETING_M
-                && (is_across() || faces(&agents[i], other))
+                && (is_across() || faces(map, &agents[i], other))
                 && is_blocked(other)
         });
         others.map(|(j, _)| j).collect()
@@ -388,7 +398,7 @@ fn backing(map: &MapGraph, agents: &[Standing<'_>], stuck: &[usize]) -> Vec<Back
         let one = &agents[i];
         let all = agents.iter().map(|other| &other.agent);
         one.agent.kind == AgentKind::Vehicle
-            && one.waited_s > STUCK_S
+            && one.waited_s > backs_up_after(map, one)
             && has_room_behind(&one.agent, all)
     };
     let could = stuck.iter().copied().filter(|&i| could(i));
@@ -1055,7 +1065,8 @@ mod tests {
         };
         assert_eq!(back([13.0, 20.0], false, true), [(0, vec![1])]);
         assert_eq!(back([20.0, 13.0], false, true), [(1, vec![0])]);
-        assert!(back([13.0, 11.0], false, true).is_empty());
+        assert_eq!(back([5.0, 6.0], false, true), [(0, vec![1])]);
+        assert!(back([5.0, 3.0], false, true).is_empty());
         assert!(back([13.0, 20.0], true, true).is_empty());
         assert!(back([13.0, 20.0], false, false).is_empty());
     }
