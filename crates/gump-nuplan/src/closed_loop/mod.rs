@@ -18,7 +18,7 @@ mod traffic;
 pub use controller::{Controller, Tracking};
 pub use driver::{Driver, PlannerInitialization, PlannerInput};
 pub use recording::Recording;
-pub use roadblocks::derive_roadblocks;
+pub use roadblocks::{derive_roadblocks, has_derived_outlines};
 pub use traffic::{ImaginedTraffic, Others, Replayed, Step, Traffic};
 
 use gump_scene::{EgoState, Frame, Rollout, SceneState};

@@ -61,6 +61,14 @@ pub fn derive_roadblocks(scenario: &mut Scenario) {
     scenario.map = map;
 }
 
+/// Whether the outlines of a map's lanes are those of [`derive_roadblocks`]: as wide as the lanes are said
+/// or estimated to be, so that the shoulder, and what lies between two lanes of a junction, are on none.
+pub fn has_derived_outlines(map: &MapGraph) -> bool {
+    // No stated outline is the same to the last bit.
+    let is_derived = |lane: &Lane| lane.outline.is_some() && lane.outline == joined_ribbon(lane);
+    map.lanes().iter().any(is_derived)
+}
+
 /// The surface of a lane without a stated outline. It reaches into the lanes linked to it: ribbons
 /// of lanes that meet at an angle leave a wedge uncovered, and a corner of the vehicle over it would
 /// count as off the road.
@@ -259,5 +267,23 @@ mod tests {
         let before = Arc::clone(map);
         derive_roadblocks(&mut scenario);
         assert!(Arc::ptr_eq(&before, &scenario.map));
+    }
+
+    #[test]
+    fn derived_outlines_are_told_from_stated_ones() {
+        let mut scenario = fixture::scenario(
+            "lane 1: 0,0 50,0 next 2
+             lane 2: 50,0 90,0
+             ego vehicle 0: 10,0",
+        )
+        .unwrap();
+        assert!(!has_derived_outlines(&scenario.map));
+        let mut parts = scenario.map.parts().clone();
+        derive_roadblocks(&mut scenario);
+        assert!(has_derived_outlines(&scenario.map));
+        for lane in &mut parts.lanes {
+            lane.outline = lane.surface().map(std::borrow::Cow::into_owned);
+        }
+        assert!(!has_derived_outlines(&MapGraph::new(parts).unwrap()));
     }
 }

@@ -20,15 +20,34 @@ const STREET: &str = "
     route 1
 ";
 
+/// The same without shoulders: a line beside the centre is off the road.
+pub(super) const NARROW: &str = "
+    lane 1: -30,0 300,0 speed 12
+    drivable: -30,-1.75 300,-1.75 300,1.75 -30,1.75
+    route 1
+";
+
 pub(super) fn recording(text: &str) -> Recording {
-    let mut scenario = fixture::scenario(&format!("{STREET}{text}")).unwrap();
+    recording_on(STREET, text)
+}
+
+pub(super) fn recording_on(street: &str, text: &str) -> Recording {
+    let mut scenario = fixture::scenario(&format!("{street}{text}")).unwrap();
     derive_roadblocks(&mut scenario);
     Recording::of_boxes(scenario).unwrap()
 }
 
 fn decide(world: &dyn WorldModel, config: InteractiveDriverConfig, text: &str) -> Decision {
+    decide_on(&recording(text), world, config)
+}
+
+fn decide_on(
+    scene: &Recording,
+    world: &dyn WorldModel,
+    config: InteractiveDriverConfig,
+) -> Decision {
     let mut driver = InteractiveDriver::new(world, config).unwrap();
-    plan_once(&recording(text), &mut driver).unwrap();
+    plan_once(scene, &mut driver).unwrap();
     driver.decision.unwrap()
 }
 
@@ -644,8 +663,9 @@ fn where_futures_are_equal_halving_takes_what_uniform_takes() {
             allocation,
             ..InteractiveDriverConfig::default()
         };
-        let all = decide(&ConstantVelocity, with(Allocation::Uniform), text);
-        let half = decide(&ConstantVelocity, with(Allocation::Halving), text);
+        let scene = recording_on(NARROW, text);
+        let all = decide_on(&scene, &ConstantVelocity, with(Allocation::Uniform));
+        let half = decide_on(&scene, &ConstantVelocity, with(Allocation::Halving));
         assert_eq!(all.chosen, half.chosen, "{text}");
         let value = |decision: &Decision| decision.candidates[decision.chosen].value;
         assert_abs_diff_eq!(value(&all), value(&half), epsilon = 1e-12);

@@ -6,7 +6,9 @@ use gump_nuplan::closed_loop::{Recording, derive_roadblocks};
 use gump_rollout::worlds::ConstantVelocity;
 use gump_scene::fixture;
 
-use super::tests::{BEHIND, ByLaw, FREE, PullsOut, at_random_speed, recording};
+use super::tests::{
+    BEHIND, ByLaw, FREE, NARROW, PullsOut, at_random_speed, recording, recording_on,
+};
 use super::*;
 
 fn with(warm_start: WarmStart) -> InteractiveDriverConfig {
@@ -82,7 +84,7 @@ fn who_rests_comes_back_within_two_seconds() {
 #[test]
 fn where_nothing_changes_the_choice_is_that_without_a_warm_start() {
     for text in [FREE, BEHIND] {
-        let scene = recording(text);
+        let scene = recording_on(NARROW, text);
         let scenes = [&scene; 9];
         let off = decisions(&ConstantVelocity, with(WarmStart::Off), &scenes);
         let rest = decisions(&ConstantVelocity, with(WarmStart::Rest), &scenes);

@@ -4,6 +4,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use gump_geometry::{DVec2, PolygonIndex};
+use gump_metrics::metres_off_road;
+use gump_nuplan::{closed_loop::has_derived_outlines, metrics};
 use gump_scene::{AreaKind, LaneId, MapGraph};
 
 /// Surfaces within this square around the ego are considered, half its side in metres. Source:
@@ -17,6 +19,8 @@ pub(crate) struct Ground {
     areas: BTreeMap<(i64, bool), Arc<PolygonIndex>>,
     near: Vec<Surface>,
     intersections: Vec<Arc<PolygonIndex>>,
+    /// Where set, its border decides whether a corner on no surface is off the road.
+    border: Option<Arc<MapGraph>>,
 }
 
 #[derive(Debug)]
@@ -31,13 +35,34 @@ struct Surface {
 pub(crate) struct Footing {
     /// Its corners are on several surfaces, none of which contains all.
     pub(crate) multiple_lanes: bool,
-    /// Some corner is on no surface.
+    /// Some corner is on no surface, and beyond the border where that counts.
     pub(crate) off_road: bool,
     /// Its centre is on no surface of the route.
     pub(crate) oncoming: bool,
 }
 
 impl Ground {
+    /// No surface yet. Where outlines of lanes are derived from their widths, corners off all lanes and car
+    /// parks are off the road only beyond the map's border, by as much as nuPlan's metric allows: vehicles
+    /// on the shoulder, or between two lanes of a junction, are not.
+    pub(crate) fn new(map: &Arc<MapGraph>) -> Self {
+        Self {
+            border: has_derived_outlines(map).then(|| Arc::clone(map)),
+            ..Self::default()
+        }
+    }
+
+    fn is_off_road(&self, corner: DVec2) -> bool {
+        let Some(map) = &self.border else {
+            return true;
+        };
+        let z = match map.road_edges().is_empty() {
+            true => 0.0,
+            false => map.elevation_at(corner).unwrap_or_default(),
+        };
+        metres_off_road(map, corner, z).is_some_and(|off| off >= metrics::TOLERANCE)
+    }
+
     /// Updates the surfaces around `center`.
     pub(crate) fn look(&mut self, map: &MapGraph, route: &BTreeSet<LaneId>, center: DVec2) {
         self.near.clear();
@@ -137,10 +162,60 @@ impl Ground {
             }
             on_route |= surface.on_route && surface.polygon.contains(center);
         }
+        let mut corners = corners.iter().zip(covered);
         Footing {
             multiple_lanes: n_touched > 1 && !held,
-            off_road: covered.contains(&false),
+            off_road: corners.any(|(corner, covered)| !covered && self.is_off_road(*corner)),
             oncoming: !on_route,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::borrow::Cow;
+
+    use gump_geometry::dvec2;
+    use gump_nuplan::closed_loop::derive_roadblocks;
+    use gump_scene::{Lane, fixture};
+
+    use super::*;
+
+    #[test]
+    fn the_shoulder_of_a_derived_lane_is_road_up_to_the_border() {
+        // A lane of 3.5 m, and a metre and a half of shoulder on its right.
+        let text = "lane 1: 0,0 50,0 next 2\nlane 2: 50,0 90,0\n{edge}\nego vehicle 0: 10,0";
+        let is_off = |edge: &str, are_stated: bool, right_m: f64| {
+            let mut scenario = fixture::scenario(&text.replace("{edge}", edge)).unwrap();
+            if are_stated {
+                let mut parts = scenario.map.parts().clone();
+                let outline = |lane: &Lane| lane.surface().map(Cow::into_owned);
+                parts
+                    .lanes
+                    .iter_mut()
+                    .for_each(|lane| lane.outline = outline(lane));
+                scenario.map = Arc::new(MapGraph::new(parts).unwrap());
+            }
+            derive_roadblocks(&mut scenario);
+            let mut ground = Ground::new(&scenario.map);
+            let center = dvec2(20.0, -right_m);
+            ground.look(&scenario.map, &BTreeSet::from([LaneId(1)]), center);
+            let corners = [(2.0, 1.0), (2.0, -1.0), (-2.0, -1.0), (-2.0, 1.0)];
+            let corners = corners.map(|(x, y)| center + dvec2(x, y));
+            let mut surfaces = Vec::new();
+            ground.within(corners[2], corners[0], &mut surfaces);
+            ground.footing(&corners, center, &surfaces).off_road
+        };
+        for edge in [
+            "edge: 90,-3.25 0,-3.25",
+            "drivable: 0,-3.25 90,-3.25 90,4 0,4",
+        ] {
+            assert!(!is_off(edge, false, 0.5), "{edge}");
+            assert!(!is_off(edge, false, 2.0), "{edge}");
+            assert!(is_off(edge, false, 3.0), "{edge}");
+            // nuPlan's maps state outlines.
+            assert!(!is_off(edge, true, 0.5), "{edge}");
+            assert!(is_off(edge, true, 2.0), "{edge}");
         }
     }
 }

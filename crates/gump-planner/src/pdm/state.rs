@@ -65,7 +65,7 @@ impl State {
             map: Arc::clone(initialization.map),
             vehicle: initialization.vehicle,
             way: None,
-            ground: Ground::default(),
+            ground: Ground::new(initialization.map),
             forecast: Forecast::default(),
             stated_limit: None,
         })
