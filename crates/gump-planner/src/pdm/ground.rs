@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use gump_geometry::{DVec2, PolygonIndex};
 use gump_metrics::metres_off_road;
-use gump_nuplan::{closed_loop::has_derived_outlines, metrics};
+use gump_nuplan::closed_loop::has_derived_outlines;
 use gump_scene::{AreaKind, LaneId, MapGraph};
 
 /// Surfaces within this square around the ego are considered, half its side in metres. Source:
@@ -43,8 +43,8 @@ pub(crate) struct Footing {
 
 impl Ground {
     /// No surface yet. Where outlines of lanes are derived from their widths, corners off all lanes and car
-    /// parks are off the road only beyond the map's border, by as much as nuPlan's metric allows: vehicles
-    /// on the shoulder, or between two lanes of a junction, are not.
+    /// parks are off the road only beyond the map's border: vehicles on the shoulder, or between two lanes
+    /// of a junction, are not.
     pub(crate) fn new(map: &Arc<MapGraph>) -> Self {
         Self {
             border: has_derived_outlines(map).then(|| Arc::clone(map)),
@@ -60,7 +60,7 @@ impl Ground {
             true => 0.0,
             false => map.elevation_at(corner).unwrap_or_default(),
         };
-        metres_off_road(map, corner, z).is_some_and(|off| off >= metrics::TOLERANCE)
+        metres_off_road(map, corner, z).is_some_and(|off| off > 0.0)
     }
 
     /// Updates the surfaces around `center`.
@@ -207,7 +207,7 @@ mod tests {
             ground.footing(&corners, center, &surfaces).off_road
         };
         for edge in [
-            "edge: 90,-3.25 0,-3.25",
+            "edge: 0,-3.25 90,-3.25",
             "drivable: 0,-3.25 90,-3.25 90,4 0,4",
         ] {
             assert!(!is_off(edge, false, 0.5), "{edge}");
