@@ -353,7 +353,7 @@ fn stands_across(agent: &Agent, other: &Agent) -> bool {
     drives && other.state.speed() < MOVES && turn.abs() > CROSSES
 }
 
-/// Time after which a vehicle that others hold backs up, seconds.
+/// Time after which a vehicle that oncoming ones hold backs up, seconds.
 fn backs_up_after(map: &MapGraph, one: &Standing<'_>) -> f64 {
     match is_inside(map, one) {
         true => STUCK_S,
@@ -394,20 +394,23 @@ fn backing(map: &MapGraph, agents: &[Standing<'_>], stuck: &[usize]) -> Vec<Back
         });
         others.map(|(j, _)| j).collect()
     };
-    let could = |i: usize| {
-        let one = &agents[i];
+    let could = |one: &BackUp| {
+        let who = &agents[one.who];
+        let is_opposed = |&j: &usize| faces(map, who, &agents[j]);
+        let after = match one.blocks.iter().all(is_opposed) {
+            true => backs_up_after(map, who),
+            false => STUCK_S,
+        };
         let all = agents.iter().map(|other| &other.agent);
-        one.agent.kind == AgentKind::Vehicle
-            && one.waited_s > backs_up_after(map, one)
-            && has_room_behind(&one.agent, all)
+        !one.blocks.is_empty() && who.waited_s > after && has_room_behind(&who.agent, all)
     };
-    let could = stuck.iter().copied().filter(|&i| could(i));
-    let could = could.map(|who| BackUp {
+    let drives = |&i: &usize| agents[i].agent.kind == AgentKind::Vehicle;
+    let all = stuck.iter().copied().filter(drives).map(|who| BackUp {
         who,
         blocks: blocked(who),
         is_on_road: !is_inside(map, &agents[who]),
     });
-    let could: Vec<_> = could.filter(|one| !one.blocks.is_empty()).collect();
+    let could: Vec<_> = all.filter(could).collect();
     let is_last = |i: usize| {
         let near = |j: usize| apart(&agents[j].agent, &agents[i].agent) < MEETING_M;
         let mut others = could.iter().filter(|other| near(other.who));

@@ -63,10 +63,13 @@ pub fn derive_roadblocks(scenario: &mut Scenario) {
 
 /// Whether the outlines of a map's lanes are those of [`derive_roadblocks`]: as wide as the lanes are said
 /// or estimated to be, so that the shoulder, and what lies between two lanes of a junction, are on none.
+///
+/// Formats state the outlines of all lanes or of none, so that the first one tells.
 pub fn has_derived_outlines(map: &MapGraph) -> bool {
+    let mut lanes = map.lanes().iter();
+    let first = lanes.find(|lane| lane.outline.is_some());
     // No stated outline is the same to the last bit.
-    let is_derived = |lane: &Lane| lane.outline.is_some() && lane.outline == joined_ribbon(lane);
-    map.lanes().iter().any(is_derived)
+    first.is_some_and(|lane| lane.outline == joined_ribbon(lane))
 }
 
 /// The surface of a lane without a stated outline. It reaches into the lanes linked to it: ribbons

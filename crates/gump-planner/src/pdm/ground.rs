@@ -46,21 +46,12 @@ impl Ground {
     /// parks are off the road only beyond the map's border: vehicles on the shoulder, or between two lanes
     /// of a junction, are not.
     pub(crate) fn new(map: &Arc<MapGraph>) -> Self {
+        let has_border = !map.road_edges().is_empty() || !map.drivable().is_empty();
+        let counts = has_border && has_derived_outlines(map);
         Self {
-            border: has_derived_outlines(map).then(|| Arc::clone(map)),
+            border: counts.then(|| Arc::clone(map)),
             ..Self::default()
         }
-    }
-
-    fn is_off_road(&self, corner: DVec2) -> bool {
-        let Some(map) = &self.border else {
-            return true;
-        };
-        let z = match map.road_edges().is_empty() {
-            true => 0.0,
-            false => map.elevation_at(corner).unwrap_or_default(),
-        };
-        metres_off_road(map, corner, z).is_some_and(|off| off > 0.0)
     }
 
     /// Updates the surfaces around `center`.
@@ -162,10 +153,16 @@ impl Ground {
             }
             on_route |= surface.on_route && surface.polygon.contains(center);
         }
-        let mut corners = corners.iter().zip(covered);
+        let is_off = |map: &MapGraph| {
+            // As in nuPlan's metric, roads above one another are told apart by the height at the centre.
+            let z = map.elevation_at(center).unwrap_or_default();
+            let mut bare = corners.iter().zip(covered).filter(|(_, covered)| !covered);
+            bare.any(|(corner, _)| metres_off_road(map, *corner, z).is_some_and(|off| off > 0.0))
+        };
+        let is_bare = covered.contains(&false);
         Footing {
             multiple_lanes: n_touched > 1 && !held,
-            off_road: corners.any(|(corner, covered)| !covered && self.is_off_road(*corner)),
+            off_road: is_bare && self.border.as_deref().is_none_or(is_off),
             oncoming: !on_route,
         }
     }

@@ -5,7 +5,8 @@
 //! simulates them, `score` scores them with the road of `ground` and the objects of `forecast`.
 //!
 //! The behaviour equals that of the authors' code, including oddities; comments mark them where
-//! they matter. Source: Dauner et al. 2023, "Parting with Misconceptions about Learning-based
+//! they matter. Only where outlines of lanes are derived, which nuPlan's are not, the shoulder beside them is
+//! road here. Source: Dauner et al. 2023, "Parting with Misconceptions about Learning-based
 //! Vehicle Motion Planning", and the released tuPlan Garage; agrees with its goldens.
 
 pub(crate) mod comfort;
