@@ -4,13 +4,16 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use gump_geometry::{DVec2, PolygonIndex};
-use gump_metrics::metres_off_road;
+use gump_metrics::Border;
 use gump_nuplan::closed_loop::has_derived_outlines;
 use gump_scene::{AreaKind, LaneId, MapGraph};
 
 /// Surfaces within this square around the ego are considered, half its side in metres. Source:
 /// tuPlan Garage.
 pub(crate) const RADIUS: f64 = 50.0;
+/// Within this square around the ego's first position the border is quick to ask, half its side in metres.
+/// Chosen by hand.
+const DRIVEN: f64 = 256.0;
 
 /// Surfaces near the ego, prepared once per lane and kept for the drive.
 #[derive(Debug, Default)]
@@ -19,8 +22,12 @@ pub(crate) struct Ground {
     areas: BTreeMap<(i64, bool), Arc<PolygonIndex>>,
     near: Vec<Surface>,
     intersections: Vec<Arc<PolygonIndex>>,
-    /// Where set, its border decides whether a corner on no surface is off the road.
-    border: Option<Arc<MapGraph>>,
+    /// Whether the map's border decides if a corner on no surface is off the road.
+    has_border: bool,
+    /// The border, once the ego has been seen.
+    border: Option<Border>,
+    /// Height of the road at the ego, metres.
+    z: f64,
 }
 
 #[derive(Debug)]
@@ -45,17 +52,21 @@ impl Ground {
     /// No surface yet. Where outlines of lanes are derived from their widths, corners off all lanes and car
     /// parks are off the road only beyond the map's border: vehicles on the shoulder, or between two lanes
     /// of a junction, are not.
-    pub(crate) fn new(map: &Arc<MapGraph>) -> Self {
-        let has_border = !map.road_edges().is_empty() || !map.drivable().is_empty();
-        let counts = has_border && has_derived_outlines(map);
+    pub(crate) fn new(map: &MapGraph) -> Self {
+        let is_stated = !map.road_edges().is_empty() || !map.drivable().is_empty();
         Self {
-            border: counts.then(|| Arc::clone(map)),
+            has_border: is_stated && has_derived_outlines(map),
             ..Self::default()
         }
     }
 
     /// Updates the surfaces around `center`.
-    pub(crate) fn look(&mut self, map: &MapGraph, route: &BTreeSet<LaneId>, center: DVec2) {
+    pub(crate) fn look(&mut self, map: &Arc<MapGraph>, route: &BTreeSet<LaneId>, center: DVec2) {
+        if self.has_border {
+            self.z = map.elevation_at(center).unwrap_or_default();
+            let border = || Border::new(map, center, self.z, DRIVEN);
+            self.border.get_or_insert_with(border);
+        }
         self.near.clear();
         for block in map.roadblocks_in_square(center, RADIUS) {
             for lane in map.roadblock_lanes(block.id) {
@@ -153,16 +164,19 @@ impl Ground {
             }
             on_route |= surface.on_route && surface.polygon.contains(center);
         }
-        let is_off = |map: &MapGraph| {
-            // As in nuPlan's metric, roads above one another are told apart by the height at the centre.
-            let z = map.elevation_at(center).unwrap_or_default();
+        let is_off = |border: &Border| {
+            // Roads above one another are told apart by the height at the ego. nuPlan's metric takes that at
+            // the centre of each box, which costs more time.
             let mut bare = corners.iter().zip(covered).filter(|(_, covered)| !covered);
-            bare.any(|(corner, _)| metres_off_road(map, *corner, z).is_some_and(|off| off > 0.0))
+            bare.any(|(corner, _)| {
+                let off = border.metres_off_road(*corner, self.z);
+                off.is_some_and(|off| off > 0.0)
+            })
         };
         let is_bare = covered.contains(&false);
         Footing {
             multiple_lanes: n_touched > 1 && !held,
-            off_road: is_bare && self.border.as_deref().is_none_or(is_off),
+            off_road: is_bare && self.border.as_ref().is_none_or(is_off),
             oncoming: !on_route,
         }
     }
