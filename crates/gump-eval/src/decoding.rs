@@ -151,6 +151,7 @@ mod tests {
             interpolation: Interpolation::Linear,
             smoothing_window: 9,
             relative_elevation: true,
+            made_scenes: false,
         };
         assert_eq!((paper.name, paper.frames(3.0)), ("paper", expected));
         let idm = paper.for_world(&WorldName::Idm);

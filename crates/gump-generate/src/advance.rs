@@ -9,22 +9,28 @@ use gump_engine::placement::rules::{Rules, state_of};
 use gump_engine::request::{Guide, Request};
 use gump_engine::temporal_ensemble::ChunkBuffer;
 use gump_engine::{EngineError, TransformerWorld};
-use gump_geometry::OrientedBox;
-use gump_model::decoder::Bins;
+use gump_geometry::{DVec2, OrientedBox};
+use gump_model::decoder::{Bins, STATE_STEPS};
 use gump_model::local_frame::LocalFrame;
 use gump_model::placed_slot::PlacedSlot;
 use gump_scene::{AgentKind, ScenarioTag, Seed};
 use gump_tokenizer::{Key, QuantizedState};
 use rayon::prelude::*;
 
+use crate::headway::Moving;
 use crate::partial_scene::PartialScene;
-use crate::{GenerateError, Placement, reason};
+use crate::{GenerateError, Placement, latin_hypercube, reason};
 
 /// Number of draws of an object made at once after the first: most objects need no more. Not tuned.
 const VOLLEY: usize = 4;
 
+/// Steps of the decoder that draw the size and the velocity; those of the place follow.
+const SIZE_AND_VELOCITY: usize = 4;
+
 /// Separates the draw of a place from those of the fields.
 const PLACE: u64 = 1 << 32;
+/// Separates the numbers of later attempts.
+const NUMBERS: u64 = 1 << 33;
 
 /// Gives every unfinished scene its next object; false once all are finished.
 pub(crate) fn advance(
@@ -61,6 +67,7 @@ pub(crate) fn advance(
             key: key?,
             partial,
             hidden,
+            first: None,
             broken: Vec::new(),
         })
     });
@@ -113,6 +120,8 @@ struct Query<'d, 'a> {
     key: Key,
     rules: Arc<Rules>,
     hidden: &'d [f32],
+    /// The first draw, once it was rejected, and the numbers that decided it, if there were any.
+    first: Option<(Bins, Option<[f64; STATE_STEPS]>)>,
     broken: Vec<String>,
 }
 
@@ -141,20 +150,25 @@ fn draw(engine: &Engine, mut queries: Vec<Query<'_, '_>>) {
         let bins = engine.sample_state(&hidden, &references, sampling);
         drawn += n;
         let is_last = drawn >= tries;
-        // Where only a queue without a head is possible, it is accepted.
-        let is_late = 2 * drawn > tries;
+        // Where only a queue without a head is possible, it is accepted, and at last whatever there is.
+        let asked = match (is_last, 2 * drawn > tries) {
+            (true, _) => Asked::Nothing,
+            (_, true) => Asked::Headway,
+            _ => Asked::All,
+        };
         let judged: Vec<Vec<Result<Found, String>>> = queries
             .par_iter()
             .zip(bins.par_chunks(n).zip(rules.par_chunks(n)))
             .map(|(query, (bins, rules))| {
                 bins.iter()
                     .zip(rules)
-                    .map(|(bins, rules)| judge(query, rules, bins, is_late))
+                    .map(|(bins, rules)| judge(query, rules, bins, asked))
                     .collect()
             })
             .collect();
         let mut left = Vec::new();
-        for (mut query, judged) in queries.into_iter().zip(judged) {
+        let bins = bins.chunks(n);
+        for ((mut query, judged), bins) in queries.into_iter().zip(judged).zip(bins) {
             let mut kept = None;
             for result in judged {
                 match result {
@@ -173,7 +187,8 @@ fn draw(engine: &Engine, mut queries: Vec<Query<'_, '_>>) {
                 None if is_last => query.partial.fail(query.key, &query.broken),
                 None => {
                     // The numbers of the first draw would give the same again.
-                    Arc::make_mut(&mut query.rules).manner.numbers = None;
+                    let numbers = Arc::make_mut(&mut query.rules).manner.numbers.take();
+                    query.first.get_or_insert((bins[0], numbers));
                     left.push(query);
                 }
             }
@@ -188,23 +203,40 @@ fn stream(query: &Query<'_, '_>, attempt: usize) -> Seed {
     query.partial.stream(2 * n_placed + 2).fork(attempt as u64)
 }
 
+/// Whether an attempt is among the first half, of which more is asked.
+fn is_early(query: &Query<'_, '_>, attempt: usize) -> bool {
+    2 * attempt < query.partial.prepared.request.config.tries
+}
+
 /// The constraints of one attempt, with a place of its own.
 fn rules(query: &Query<'_, '_>, attempt: usize) -> Arc<Rules> {
-    let Some(draw) = &query.rules.places else {
-        return Arc::clone(&query.rules);
-    };
-    let seed = stream(query, attempt).fork(PLACE);
-    Arc::new(Rules {
-        places: Some(draw.again(seed)),
-        ..Rules::clone(&query.rules)
-    })
+    let mut rules = Arc::clone(&query.rules);
+    let seed = stream(query, attempt);
+    if let (Some((_, Some(first))), true) = (query.first, is_early(query, attempt)) {
+        let tries = query.partial.prepared.request.config.tries;
+        let spread = attempt as f64 / tries as f64;
+        let is_place = |step| step >= SIZE_AND_VELOCITY;
+        let numbers = latin_hypercube::near(&first, seed.fork(NUMBERS), spread, is_place);
+        Arc::make_mut(&mut rules).manner.numbers = Some(numbers);
+    }
+    if let Some(draw) = &query.rules.places {
+        Arc::make_mut(&mut rules).places = Some(draw.again(seed.fork(PLACE)));
+    }
+    rules
 }
 
 fn request(query: &Query<'_, '_>, rules: &Arc<Rules>, attempt: usize) -> Request {
     let guide: Arc<dyn Guide> = Arc::<Rules>::clone(rules);
+    let mut forced = query.partial.given(query.key);
+    // Another place is tried before another size and velocity: rejected draws would otherwise leave too
+    // few vehicles that stand, long ones and fast ones.
+    if let (Some((first, _)), true) = (query.first, is_early(query, attempt)) {
+        let kept = forced.iter_mut().zip(first).take(SIZE_AND_VELOCITY);
+        kept.for_each(|(bin, of_first)| *bin = bin.or(Some(of_first)));
+    }
     Request {
         local_frame: LocalFrame::SCENE,
-        forced: query.partial.given(query.key),
+        forced,
         stream: stream(query, attempt),
         near: None,
         ring: ChunkBuffer::default(),
@@ -214,22 +246,26 @@ fn request(query: &Query<'_, '_>, rules: &Arc<Rules>, attempt: usize) -> Request
     }
 }
 
+/// What is asked of a draw so that traffic can go on.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Asked {
+    All,
+    /// That who drives can stop behind who is ahead.
+    Headway,
+    Nothing,
+}
+
 /// A state and its outline.
 type Found = (QuantizedState, OrientedBox);
 
 /// The drawn state, or the constraint it violates. The ego's box is given and therefore valid.
-fn judge(
-    query: &Query<'_, '_>,
-    rules: &Rules,
-    bins: &Bins,
-    is_late: bool,
-) -> Result<Found, String> {
+fn judge(query: &Query<'_, '_>, rules: &Rules, bins: &Bins, asked: Asked) -> Result<Found, String> {
     let state = state_of(bins);
     let prepared = query.partial.prepared;
     let (map, world_from_scene) = (&prepared.request.map, prepared.scene.world_from_scene);
     let outline = rules.outline(&state, map, world_from_scene);
     let broken = rules.broken(&state, &outline, map, world_from_scene);
-    let holds_up = || holds_up_traffic(query, &state, &outline).filter(|_| !is_late);
+    let holds_up = || holds_up_traffic(query, &state, &outline, asked);
     let broken = broken.or_else(holds_up);
     match broken {
         Some(clause) if !query.key.is_ego() || clause.starts_with("speed") => Err(clause),
@@ -248,20 +284,20 @@ const STANDING: [&str; 6] = [
 ];
 
 /// The reason for rejecting a vehicle that stands in a lane without cause, or that will meet another in
-/// a junction. An ego whose prompts ask for standing may stand.
+/// a junction, and an object before which another cannot stop, or the other way round. An ego whose
+/// prompts ask for standing may stand.
 fn holds_up_traffic(
     query: &Query<'_, '_>,
     state: &QuantizedState,
     outline: &OrientedBox,
+    asked: Asked,
 ) -> Option<String> {
     let prepared = query.partial.prepared;
     let request = prepared.request;
     let stands = |tag: &ScenarioTag| STANDING.iter().any(|begin| tag.name().starts_with(begin));
     let is_told = request.ego.velocity.is_some() || request.prompts.iter().any(stands);
-    let is_asked = request.config.standing_has_reasons
-        && request.config.placement == Placement::Guided
-        && query.rules.kind != AgentKind::Pedestrian;
-    if !is_asked {
+    let is_guided = request.config.placement == Placement::Guided;
+    if !request.config.ready_to_drive || !is_guided || asked == Asked::Nothing {
         return None;
     }
     let may_stand = query.rules.spec.speed.is_some() || (query.key.is_ego() && is_told);
@@ -272,6 +308,39 @@ fn holds_up_traffic(
     let others: Vec<OrientedBox> = query.rules.taken.iter().map(world).collect();
     let (own, speed) = (world(outline), state.velocity().length());
     let (map, lights) = (&request.map, &request.lights);
+    let in_world =
+        |state: &QuantizedState| prepared.scene.world_from_scene.rotate(state.velocity());
+    let is_on_foot = query.rules.kind == AgentKind::Pedestrian;
+    let one = Moving {
+        outline: own,
+        velocity: in_world(state),
+    };
+    // Fixtures come after the agents, and stand.
+    let agents = query.partial.agents.iter();
+    let walks = agents
+        .clone()
+        .map(|agent| agent.key.kind == AgentKind::Pedestrian);
+    let velocities = agents.map(|agent| in_world(&agent.state));
+    let velocities = velocities.chain(std::iter::repeat(DVec2::ZERO));
+    let walks = walks.chain(std::iter::repeat(false));
+    let meets = |((outline, velocity), walks): ((&OrientedBox, DVec2), bool)| {
+        let other = Moving {
+            outline: *outline,
+            velocity,
+        };
+        let runs_into = |one: &Moving, other: &Moving| one.runs_into(other, map);
+        one.meets(&other)
+            || !is_on_foot && runs_into(&one, &other)
+            || !walks && runs_into(&other, &one)
+    };
+    // A gap that was asked for is kept.
+    let is_free = query.rules.rows.is_empty();
+    if is_free && others.iter().zip(velocities).zip(walks).any(meets) {
+        return Some("speed: too fast to stop before another".into());
+    }
+    if is_on_foot || asked != Asked::All {
+        return None;
+    }
     if !may_stand && reason::stands_without(&own, speed, map, lights, &others) {
         return Some("speed: nothing holds it back".into());
     }

@@ -159,6 +159,7 @@ fn imagine(
 ) -> Result<Vec<Rollout>, GenerateError> {
     let config = SimulateConfig {
         seconds,
+        made_scenes: true,
         ..SimulateConfig::default()
     };
     let result = match drive {

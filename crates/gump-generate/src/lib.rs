@@ -43,6 +43,7 @@ pub mod check;
 pub mod constraint;
 mod drive;
 mod futures;
+mod headway;
 mod latin_hypercube;
 mod object_check;
 mod partial_scene;

@@ -31,6 +31,9 @@ const STANDS: f64 = 0.5;
 /// otherwise it is parked. Metres and radians, as in the relative network's world.
 const IN_LANE_M: f64 = 1.0;
 const ALONG: f64 = 0.35;
+/// One that is in no lane, but this near to a lane of a junction and to no other, is in the junction,
+/// metres.
+const INSIDE_M: f64 = 4.0;
 /// Maximum distance of a reason ahead of the front bumper, metres: a light or sign (it waits a few
 /// cars behind the line), a junction, another agent (a gap of two cars).
 const LINE_M: f64 = 25.0;
@@ -59,8 +62,8 @@ pub(crate) fn stands_without(
     }
     let Some(lane) = lane_of(own.pose, map) else {
         // Nobody parks in a junction.
-        let mut near = map.lanes_near(own.pose.position, IN_LANE_M);
-        return near.any(|(lane, _)| lane.in_intersection);
+        let mut near = map.lanes_near(own.pose.position, INSIDE_M);
+        return near.next().is_some_and(|(lane, _)| lane.in_intersection);
     };
     let from = lane.centerline.project(own.pose.position).arc_length;
     let front = own.length / 2.0;
@@ -110,7 +113,7 @@ pub(crate) fn meets_in_junction(own: &OrientedBox, map: &MapGraph, others: &[Ori
 }
 
 /// The lane in whose middle an agent is, if there is one.
-fn lane_of(pose: Pose, map: &MapGraph) -> Option<&Lane> {
+pub(crate) fn lane_of(pose: Pose, map: &MapGraph) -> Option<&Lane> {
     let near = map.lanes_near(pose.position, IN_LANE_M);
     let along = near.filter(|(lane, _)| lane.foot(pose).turned < ALONG);
     let nearest = along.min_by(|a, b| a.1.total_cmp(&b.1).then(a.0.id.cmp(&b.0.id)));
@@ -118,7 +121,11 @@ fn lane_of(pose: Pose, map: &MapGraph) -> Option<&Lane> {
 }
 
 /// The paths ahead of a position on a lane, each with its lanes.
-fn ways<'m>(map: &'m MapGraph, lane: &'m Lane, from: f64) -> Vec<(Vec<&'m Lane>, Polyline)> {
+pub(crate) fn ways<'m>(
+    map: &'m MapGraph,
+    lane: &'m Lane,
+    from: f64,
+) -> Vec<(Vec<&'m Lane>, Polyline)> {
     let rest = lane.centerline.slice(from, lane.centerline.length());
     let mut next: Vec<&Lane> = map.successors(lane.id).collect();
     next.sort_by_key(|lane| lane.id);

@@ -139,11 +139,12 @@ pub struct GenerateConfig {
     /// and in car parks, where two of five recorded vehicles are. Scenes then fail the check that
     /// vehicles are on the road.
     pub parks_off_road: bool,
-    /// Whether a vehicle that stands in a lane needs a reason: a light, a sign, a junction or
-    /// another agent ahead, in a junction an agent ahead; and whether no two vehicles may be across each
-    /// other's ways in a junction. In guided placement only. It makes scenes less like recorded ones,
-    /// but their rollouts better.
-    pub standing_has_reasons: bool,
+    /// Whether traffic must be able to go on from the scene. A vehicle that stands in a lane then needs a
+    /// reason (a light, a sign, a junction or another agent ahead, in a junction an agent ahead), no two
+    /// vehicles are across each other's ways in a junction, and who drives can stop behind who is ahead
+    /// (paper: no). In guided placement only. Reasons to stand are waived in the second half of an object's
+    /// draws.
+    pub ready_to_drive: bool,
     /// Whether the network reads the prompts as tokens. Without them, prompts still choose the place
     /// and which scenes are accepted.
     pub prompt_tokens: bool,
@@ -168,6 +169,8 @@ impl GenerateConfig {
             smoothing_bins: 0.0,
             smoothed_sizes: true,
             even: false,
+            placement_network: false,
+            ready_to_drive: false,
             ..Self::default()
         }
     }
@@ -185,9 +188,9 @@ impl Default for GenerateConfig {
             smoothing_bins: 0.7,
             smoothed_sizes: true,
             even: true,
-            placement_network: false,
+            placement_network: true,
             parks_off_road: false,
-            standing_has_reasons: false,
+            ready_to_drive: true,
             top_k: 1000,
             placement: Placement::Guided,
             prompt_tokens: true,

@@ -12,6 +12,7 @@ use gump_scene::{Agent, AgentId, AgentKind, Frame, Seed, fixture};
 
 use super::*;
 use crate::constraint::parse_constraints;
+use crate::headway::Moving;
 
 /// Two lanes each way with edges, a crosswalk, a light.
 const ROAD: &str = "lane 1: -100,-2 100,-2 width 3.6
@@ -84,6 +85,31 @@ fn scenes_have_what_was_asked_for_and_nobody_overlaps() {
         scenario.validate().unwrap();
         assert_eq!(scene.frame.lights().len(), 1);
     }
+}
+
+#[test]
+fn who_drives_can_stop_unless_that_does_not_matter() {
+    let mut request = request(Vec::new());
+    let n_cannot = |request: &GenerateRequest| {
+        let scenes = make(request, 8);
+        let pairs = scenes.iter().flat_map(|scene| {
+            let agents = scene.frame.agents().iter();
+            let moving = agents.clone().map(|agent| Moving {
+                outline: agent.oriented_box(),
+                velocity: agent.state.velocity,
+            });
+            let drives = agents.map(|agent| agent.kind != AgentKind::Pedestrian);
+            let moving: Vec<(Moving, bool)> = moving.zip(drives).collect();
+            let drives = moving.clone().into_iter().filter(|(_, drives)| *drives);
+            drives.flat_map(move |(one, _)| moving.clone().into_iter().map(move |m| (one, m.0)))
+        });
+        let cannot = pairs.filter(|(one, other)| one.runs_into(other, &request.map));
+        cannot.count()
+    };
+    assert_eq!(n_cannot(&request), 0);
+    request.config.ready_to_drive = false;
+    let n = n_cannot(&request);
+    assert!(n > 0, "{n}");
 }
 
 #[test]

@@ -31,6 +31,8 @@ pub struct SimulateConfig {
     /// True: agents keep their height over the road they are on. False: the world's elevations are
     /// kept.
     pub relative_elevation: bool,
+    /// Whether the scenes are made rather than recorded (see [`Session::take_for_made`]).
+    pub made_scenes: bool,
 }
 
 impl Default for SimulateConfig {
@@ -42,6 +44,7 @@ impl Default for SimulateConfig {
             interpolation: Interpolation::Hermite,
             smoothing_window: 0,
             relative_elevation: true,
+            made_scenes: false,
         }
     }
 }
@@ -81,6 +84,9 @@ pub fn simulate(
         return Err(RolloutError::Duration(config.seconds).into());
     }
     let mut session = world.open(starts)?;
+    if config.made_scenes {
+        session.take_for_made();
+    }
     let dt = session.dt();
     let mut futures = Vec::new();
     for start in starts {

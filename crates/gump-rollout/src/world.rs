@@ -153,6 +153,12 @@ pub trait Session {
         false
     }
 
+    /// Takes the scenes for made rather than recorded, from the next step on: nobody is parked in a lane,
+    /// even if it has stood there from the first frame on.
+    ///
+    /// A session that makes no difference between them ignores it, as the default does.
+    fn take_for_made(&mut self) {}
+
     /// Records predictive samples in later steps; true if it does. Futures do not change.
     ///
     /// A session whose states are not drawn from distributions returns false, as the default does.

@@ -267,6 +267,10 @@ impl Session for LivingSession<'_> {
         self.session.exchange(future, leave, come)
     }
 
+    fn take_for_made(&mut self) {
+        self.session.take_for_made();
+    }
+
     fn probe(&mut self, config: ProbeConfig) -> bool {
         self.session.probe(config)
     }

@@ -80,11 +80,11 @@ pub(crate) struct Args {
     /// Placement of objects
     #[arg(long, value_parser = one_of(PLACEMENTS), default_value_t = Placement::Guided)]
     placement: Placement,
-    /// Draw the places of vehicles from the placement network: queues before red lights, usual gaps
+    /// Draw the places of vehicles from the sequence network: evenly along lanes, without queues
     #[arg(long)]
-    placement_network: bool,
-    /// With --placement-network: park vehicles beyond the edges of the road as well
-    #[arg(long, requires = "placement_network")]
+    no_placement_network: bool,
+    /// Park vehicles beyond the edges of the road as well
+    #[arg(long, conflicts_with = "no_placement_network")]
     parks_off_road: bool,
     /// Weights of the model [default: the shipped ones]
     #[arg(long, value_name = "FILE", value_parser = worlds::weights)]
@@ -173,11 +173,12 @@ impl Args {
                 "--simulate: expected a number from 0 to 3600, found {}",
                 self.simulate
             )
-        } else if self.placement_network && self.placement != Placement::Guided {
-            format!(
-                "--placement-network: expected --placement guided, found {}",
-                self.placement
-            )
+        } else if self.parks_off_road && (self.placement != Placement::Guided || self.paper) {
+            let found = match self.paper {
+                true => "--paper".into(),
+                false => format!("--placement {}", self.placement),
+            };
+            format!("--parks-off-road: expected guided placement, found {found}")
         } else {
             return Ok(());
         };
@@ -211,10 +212,8 @@ impl Args {
             temperature: self.temperature.unwrap_or(manner.temperature),
             top_k: self.top_k.map_or(manner.top_k, NonZeroUsize::get),
             placement: self.placement,
-            placement_network: self.placement_network,
+            placement_network: manner.placement_network && !self.no_placement_network,
             parks_off_road: self.parks_off_road,
-            // Agents that stand without a reason would still be there half a minute later.
-            standing_has_reasons: self.simulate > 0.0 && !self.paper,
             ..manner
         }
     }

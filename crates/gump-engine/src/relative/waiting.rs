@@ -450,6 +450,21 @@ fn is_inside(map: &MapGraph, one: &Standing<'_>) -> bool {
     near.next().is_some_and(|(lane, _)| lane.in_intersection)
 }
 
+/// Whether an agent of a made scene waits if it stands: it is in a lane, or in a junction, where nobody
+/// parks.
+pub(super) fn waits_if_made(map: &MapGraph, agent: &Agent) -> bool {
+    let pose = agent.state.pose;
+    let beside = match agent.kind {
+        AgentKind::Vehicle => IN_LANE_M,
+        AgentKind::Bicycle => BESIDE_M,
+        _ => return false,
+    };
+    let mut lanes = map.lanes_near(pose.position, beside);
+    let mut near = map.lanes_near(pose.position, ASTRAY_INSIDE_M);
+    lanes.any(|(lane, _)| lane.foot(pose).turned < ALONG)
+        || near.next().is_some_and(|(lane, _)| lane.in_intersection)
+}
+
 /// Whether an agent was driving and is on a lane of a junction whose light has ended its green.
 fn has_to_clear(map: &MapGraph, lights: &[Light], one: &Standing<'_>) -> bool {
     if !one.has_driven || lights.is_empty() {

@@ -41,7 +41,9 @@ use crate::relative::rules::{
 };
 use crate::relative::seen::{FrameIndex, ObservedAgent, add_presents};
 use crate::relative::turning_in::TakesWay;
-use crate::relative::waiting::{AT_GREEN_S, INSISTS_S, Standing, has_room_behind, released};
+use crate::relative::waiting::{
+    AT_GREEN_S, INSISTS_S, Standing, has_room_behind, released, waits_if_made,
+};
 use crate::sampling::{Routes, SamplingConfig};
 
 pub use live::LiveFuture;
@@ -439,6 +441,8 @@ struct Future {
     frames: usize,
     /// Frames of the history.
     history: usize,
+    /// Whether the scene is made rather than recorded: a scene of one frame is.
+    is_made: bool,
     members: Vec<Member>,
     /// Agents that are not predicted.
     others: Vec<Agent>,
@@ -479,6 +483,7 @@ impl Future {
             seed: Seed(0),
             frames: 0,
             history: frames.len(),
+            is_made: state.history.len() == 1,
             members: Vec::new(),
             others,
             lights: state.now().lights().to_vec(),
@@ -501,7 +506,20 @@ impl Future {
         for member in &mut future.members {
             member.recall(state.history, stride);
         }
+        if future.is_made {
+            future.take_for_made();
+        }
         Ok(future)
+    }
+
+    /// Who stands in a lane or a junction of a made scene waits, and what else holds after nine seconds, since nothing is
+    /// known of the past by then, holds from the start.
+    fn take_for_made(&mut self) {
+        self.is_made = true;
+        let map = &self.scene.source;
+        for member in &mut self.members {
+            member.has_driven |= waits_if_made(map, &member.agent);
+        }
     }
 
     /// Reads a frame of history: the states of the present agents that are in it.
@@ -556,9 +574,9 @@ impl Future {
         }
     }
 
-    /// Whether it is longer than benchmarks show.
+    /// Whether it is longer than benchmarks show, or of a made scene.
     fn is_late(&self) -> bool {
-        self.frames >= self.history + LATE
+        self.is_made || self.frames >= self.history + LATE
     }
 
     /// Lets it read the present again, after others have come or gone.
@@ -1273,6 +1291,10 @@ impl Session for RelativeSession<'_> {
             futures.binary_search(&(at - 1)).is_ok()
         });
         true
+    }
+
+    fn take_for_made(&mut self) {
+        self.futures.iter_mut().for_each(Future::take_for_made);
     }
 
     fn probe(&mut self, config: ProbeConfig) -> bool {

@@ -19,11 +19,10 @@ const TRIES: usize = 20;
 pub enum SceneSource {
     /// The model, with its own manner of drawing.
     Model(Placement),
-    /// The model, the placement network placing vehicles on the road, or beyond its edges as well.
-    Placed {
-        /// Beyond the edges of the road as well.
-        off_road: bool,
-    },
+    /// The same, vehicles placed beyond the edges of the road as well.
+    OffRoad,
+    /// The same, the sequence network placing vehicles.
+    Sequence,
     /// The model, with the manner of drawing of the paper.
     Paper,
     /// Anywhere on lanes.
@@ -45,8 +44,8 @@ impl SceneSource {
     pub const ALL: [Self; 11] = [
         Self::Model(Placement::Guided),
         Self::Model(Placement::Free),
-        Self::Placed { off_road: false },
-        Self::Placed { off_road: true },
+        Self::OffRoad,
+        Self::Sequence,
         Self::Paper,
         Self::Random,
         Self::Retrieval,
@@ -61,8 +60,8 @@ impl SceneSource {
         match self {
             Self::Model(Placement::Guided) => "model guided",
             Self::Model(Placement::Free) => "model free",
-            Self::Placed { off_road: false } => "model guided, placement network",
-            Self::Placed { off_road: true } => "the same, parks off road",
+            Self::OffRoad => "model guided, parks off road",
+            Self::Sequence => "model guided, without placement network",
             Self::Paper => "model guided, paper's draws",
             Self::Random => "random along lanes",
             Self::Retrieval => "retrieval",
@@ -219,13 +218,21 @@ impl SceneMakers<'_> {
                     ..GenerateConfig::default()
                 },
             ),
-            SceneSource::Placed { off_road } => self.generate(
+            SceneSource::OffRoad => self.generate(
                 &case.recorded,
                 n,
                 seed,
                 GenerateConfig {
-                    placement_network: true,
-                    parks_off_road: off_road,
+                    parks_off_road: true,
+                    ..GenerateConfig::default()
+                },
+            ),
+            SceneSource::Sequence => self.generate(
+                &case.recorded,
+                n,
+                seed,
+                GenerateConfig {
+                    placement_network: false,
                     ..GenerateConfig::default()
                 },
             ),

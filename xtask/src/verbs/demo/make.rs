@@ -3,7 +3,7 @@
 use gump_eval::worlds::World;
 use gump_generate::check::{off_road, overlaps};
 use gump_generate::pipeline::{GenerationJob, GenerationWorlds, make_many};
-use gump_generate::{Counts, GenerateConfig, GenerateRequest};
+use gump_generate::{Counts, GenerateRequest};
 use gump_model::Device;
 use gump_scene::ScenarioTag;
 use gump_viz::{Camera, PictureSpec, draw_scene, log_as_rollout};
@@ -39,10 +39,6 @@ pub(super) fn scene(demo: &mut Demo, run: &mut Run) -> anyhow::Result<Value> {
         request: GenerateRequest {
             prompts: vec![prompt],
             counts: Some(COUNTS),
-            config: GenerateConfig {
-                standing_has_reasons: true,
-                ..GenerateConfig::default()
-            },
             ..GenerateRequest::in_place_of(&demo.scenario)
         },
         roams: false,

@@ -85,6 +85,33 @@ fn vehicles_follow_their_routes() {
 }
 
 #[test]
+fn who_stands_in_a_lane_of_a_made_scene_waits() {
+    let text = "lane 1: 0,0 200,0 speed 13\nego vehicle 0: 10,0 velocity 5,0\n\
+                agent vehicle 1: 60,0\nagent vehicle 2: 90,4";
+    let recorded = fixture::scenario(text).unwrap();
+    let world = ruled();
+    let begun = |scenario: &Scenario| future(&world, scenario, 1, 0).0;
+    let has_driven = |future: &Future| -> Vec<bool> {
+        let members = future.members.iter();
+        members.map(|member| member.has_driven).collect()
+    };
+    let mut future = begun(&recorded);
+    assert_eq!(has_driven(&future), [true, false, false]);
+    assert!(!future.is_late());
+    // Who stands beside the lane may be parked all the same.
+    future.take_for_made();
+    assert_eq!(has_driven(&future), [true, true, false]);
+    assert!(future.is_late());
+    // A scene without a past is made.
+    let mut snapshot = recorded.clone();
+    snapshot.log.drain(..snapshot.now);
+    snapshot.now = 0;
+    let future = begun(&snapshot);
+    assert_eq!(has_driven(&future), [true, true, false]);
+    assert!(future.is_late());
+}
+
+#[test]
 fn without_routes_there_are_none() {
     let (future, meant) = future(&world(Routes::Never), &fork(), 1, 6);
     assert_eq!(meant, None);
