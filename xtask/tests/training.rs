@@ -334,12 +334,17 @@ fn the_recorded_stages_of_the_relative_network_can_be_run() {
     on_these("placement.toml");
     place.results("placement.toml --steps 2", "placement");
     // Realism needs road edges, which the scenes here do not have.
-    on_these("relative-rewards.toml");
-    place.fails(
-        "relative-rewards.toml --steps 1",
-        1,
-        &["realism: no scene has", "road edges"],
-    );
+    for (name, out) in [
+        ("relative-rewards.toml", "rewards"),
+        ("relative-10.toml", "ten"),
+    ] {
+        on_these(name);
+        place.fails(
+            &format!("{name} --steps 1 --out {out}"),
+            1,
+            &["realism: no scene has", "road edges"],
+        );
+    }
 }
 
 /// A very small network with relative attention, whose second stage drives.
