@@ -120,7 +120,7 @@ struct Query<'d, 'a> {
     key: Key,
     rules: Arc<Rules>,
     hidden: &'d [f32],
-    /// The first draw, once it was rejected, and the numbers that decided it, if there were any.
+    /// The first draw of one without a given place, once it was rejected, and the numbers that decided it, if there were any.
     first: Option<(Bins, Option<[f64; STATE_STEPS]>)>,
     broken: Vec<String>,
 }
@@ -188,7 +188,10 @@ fn draw(engine: &Engine, mut queries: Vec<Query<'_, '_>>) {
                 None => {
                     // The numbers of the first draw would give the same again.
                     let numbers = Arc::make_mut(&mut query.rules).manner.numbers.take();
-                    query.first.get_or_insert((bins[0], numbers));
+                    // Where the place is given, only another velocity can help.
+                    if !query.key.is_ego() && query.rules.rows.is_empty() {
+                        query.first.get_or_insert((bins[0], numbers));
+                    }
                     left.push(query);
                 }
             }

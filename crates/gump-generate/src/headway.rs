@@ -3,6 +3,10 @@
 //! Objects are drawn one after another, each with a speed of its own. Without this check a vehicle at
 //! 10 m/s appears a few metres behind one that stands, and of 108 scenes 24 had an overlap within the
 //! first seconds (result 58).
+//!
+//! `has_headway` of `spawning.rs` in `gump-engine` asks the same of an agent that enters a running scene at
+//! the border. That looks straight ahead, since whoever enters follows a road; here a place may be before a
+//! bend or a fork, so the lanes are followed.
 
 use gump_geometry::{DVec2, OrientedBox, Polyline};
 use gump_scene::MapGraph;
