@@ -75,11 +75,12 @@ impl Wish {
     }
 }
 
-/// Makes scenes; a list of dictionaries.
+/// Makes scenes with `world`, whose seconds `traffic` simulates; a list of dictionaries.
 #[pyfunction]
 pub(crate) fn generate<'py>(
     py: Python<'py>,
     world: &World,
+    traffic: &World,
     scenario: &Scenario,
     wish: &Bound<'py, PyAny>,
 ) -> PyResult<Bound<'py, PyList>> {
@@ -89,18 +90,23 @@ pub(crate) fn generate<'py>(
             "world: expected a network that generates scenes, found one that does not",
         ));
     };
+    if matches!(traffic.kind, Kind::Log) {
+        return Err(errors::value(
+            "traffic: expected a world that simulates new scenes, found log",
+        ));
+    }
+    let traffic = traffic.model(&scenario.scene)?;
+    let worlds = GenerationWorlds {
+        scenes: model,
+        traffic: &*traffic,
+    };
     let order = wish.order(&scenario.scene.scenario)?;
     let list = PyList::empty(py);
     for first in (0..wish.count).step_by(BATCH as usize) {
         py.check_signals()?;
         let numbers = first..(first + BATCH).min(wish.count);
         let checked = threads::work(py, || {
-            make_many(
-                GenerationWorlds::of(model),
-                &order,
-                numbers,
-                Seed(wish.seed),
-            )
+            make_many(worlds, &order, numbers, Seed(wish.seed))
         })?;
         for checked in checked.map_err(errors::value)? {
             list.append(scene_dict(py, checked.map_err(errors::runtime)?)?)?;

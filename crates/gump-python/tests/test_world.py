@@ -180,6 +180,17 @@ def test_scenes_from_nothing(crossing):
         assert scene.attempts >= 1 and isinstance(scene.holds, bool)
     (moving,) = gump.generate(crossing, vehicles=2, seconds=2.0, seed=3)
     assert len(moving.scenario) - moving.scenario.now - 1 == 20
+    # Another world moves the same scene.
+    still = gump.World("constant-velocity")
+    (steady,) = gump.generate(crossing, vehicles=2, seconds=2.0, seed=3, traffic=still)
+    now, later = steady.scenario.now, len(steady.scenario) - 1
+    tracks, moved = steady.scenario.tracks, moving.scenario.tracks
+    assert (tracks.position[:, now] == moved.position[:, now]).all()
+    assert (tracks.position[:, later] != moved.position[:, later]).any()
+    expected = tracks.position[:, now, :2] + 2.0 * tracks.velocity[:, now]
+    assert np.allclose(tracks.position[:, later, :2], expected, atol=1e-3)
+    with pytest.raises(ValueError, match="traffic: expected a world that simulates new scenes, found log"):
+        gump.generate(crossing, vehicles=2, traffic=gump.World("log"))
     with pytest.raises(ValueError, match='prompt: "behnd_bike" is not one of the 73 scenario tags'):
         gump.generate(crossing, "behnd_bike")
     for other in ("idm", "model"):

@@ -89,6 +89,16 @@ impl<W: WorldModel + ?Sized> WorldModel for Box<W> {
     }
 }
 
+impl<W: WorldModel + ?Sized> WorldModel for &W {
+    fn name(&self) -> &str {
+        (**self).name()
+    }
+
+    fn open(&self, starts: &[Start<'_>]) -> Result<Box<dyn Session + '_>, BoxError> {
+        (**self).open(starts)
+    }
+}
+
 /// A scene to continue, the number of futures, and their seed.
 #[derive(Clone, Copy, Debug)]
 pub struct Start<'a> {

@@ -201,19 +201,21 @@ def generate(
     attempts: int = 20,
     seed: int = 0,
     world: Optional[World] = None,
+    traffic: Optional[World] = None,
 ) -> List[Generated]:
     """Makes `count` scenes on the map of a scenario.
 
     `prompt` are up to four of nuPlan's scenario tags. `vehicles` (besides the ego), `pedestrians` and
     `bicycles` say how many; with none given the network decides. `objects` are wishes for single
-    objects as TOML text. `seconds` of every scene's future are imagined. `anywhere` lets the ego start
+    objects as TOML text. `seconds` of every scene's future are simulated. `anywhere` lets the ego start
     on any lane around there; `guided` puts objects on lanes and walkways only.
 
     Raises `ValueError` for an unknown tag, contradicting wishes and numbers out of range,
     `RuntimeError` if a scene cannot be made.
 
-    `world` is a sequence network, the only one that makes scenes; by default the one that comes with
-    the package.
+    `world` is a sequence network, the only kind that makes scenes; by default the one that comes with
+    the package. `traffic` simulates the seconds that follow, and the moments at which prompts are
+    checked; by default the relative network that comes with the package. Any world but "log" will do.
     """
     wish = {
         "prompts": [prompt] if isinstance(prompt, str) else list(prompt),
@@ -229,7 +231,8 @@ def generate(
         "seed": seed,
     }
     world = World(f"model:{GENERATOR_WEIGHTS}") if world is None else world
-    made = _native.generate(world._world, _scenario(scenario), wish)
+    traffic = World() if traffic is None else traffic
+    made = _native.generate(world._world, traffic._world, _scenario(scenario), wish)
     return [Generated(**one) for one in made]
 
 

@@ -13,12 +13,20 @@ const LEAST: f64 = 1e-9;
 /// Numbers of the moves of each future, `[future][agent, move]`.
 pub(super) type ByMove = Vec<Vec<f64>>;
 
-/// The scored steps at which agents first collide and first leave the road, per future and agent.
-pub(super) type Faults = [Vec<Vec<Option<usize>>>; 2];
+/// The scored steps at which agents first collide, first leave the road and first pass a red light,
+/// per future and agent.
+pub(super) type Faults = [Vec<Vec<Option<usize>>>; FAULTS.len()];
+
+/// What the dense term is for.
+const FAULTS: [Component; 3] = [
+    Component::Collision,
+    Component::Offroad,
+    Component::TrafficLightViolation,
+];
 
 /// The faults that the metric finds in the futures of an evaluation.
 pub(super) fn faults(evaluation: &Evaluation<'_>) -> Faults {
-    [Component::Collision, Component::Offroad].map(|fault| evaluation.first_indications(fault))
+    FAULTS.map(|fault| evaluation.first_indications(fault))
 }
 
 /// The advantage of every move of the scored agents; `None` if all futures are equally good.
@@ -81,22 +89,24 @@ fn to_go(credit: &[f64], per_move: usize) -> Vec<f64> {
 
 /// For each move minus one for each fault that its agent first commits in it or later.
 fn penalties(faults: &Faults, n_moves: usize, per_move: usize) -> ByMove {
-    let [collisions, exits] = faults;
-    let of_agent = |(collision, exit): (&Option<usize>, &Option<usize>)| {
+    let of_agent = |firsts: [Option<usize>; FAULTS.len()]| {
         let mut rewards = vec![0.0; n_moves * per_move];
-        for step in [collision, exit].into_iter().flatten() {
+        for step in firsts.into_iter().flatten() {
             // Steps after the last whole move belong to none.
-            if let Some(reward) = rewards.get_mut(*step) {
+            if let Some(reward) = rewards.get_mut(step) {
                 *reward -= 1.0;
             }
         }
         to_go(&rewards, per_move)
     };
-    let futures = collisions.iter().zip(exits);
-    let of_future = |(collisions, exits): (&Vec<_>, &Vec<_>)| {
-        collisions.iter().zip(exits).flat_map(of_agent).collect()
+    let [collisions, ..] = faults;
+    let of_future = |i: usize| {
+        let agents = 0..collisions[i].len();
+        agents
+            .flat_map(|agent| of_agent(faults.each_ref().map(|fault| fault[i][agent])))
+            .collect()
     };
-    futures.map(of_future).collect()
+    (0..collisions.len()).map(of_future).collect()
 }
 
 /// Less the mean over the futures; with the sum of squares that is left.
@@ -156,7 +166,7 @@ mod tests {
     const REALISM: f64 = 0.58;
 
     fn nobody() -> Faults {
-        [vec![vec![None; 2]; 3], vec![vec![None; 2]; 3]]
+        std::array::from_fn(|_| vec![vec![None; 2]; 3])
     }
 
     fn found(rewards: &RelativeRewards, worth: &LeaveOneOut, faults: &Faults) -> Option<ByMove> {
@@ -212,10 +222,11 @@ mod tests {
     #[test]
     fn a_collision_lowers_the_advantages_of_the_moves_before_it() {
         let mut faults = nobody();
-        // The second agent of the first future collides in its second move, and the first agent of
-        // the third leaves the road in its first.
+        // The second agent of the first future collides in its second move, and the first agents of
+        // the third and the second leave the road and pass a red light in their first and second.
         faults[0][0][1] = Some(2);
         faults[1][2][0] = Some(1);
+        faults[2][1][0] = Some(3);
         for advantage in [Advantage::Agent, Advantage::Scene] {
             let plain = found(&rewards(advantage, 0.0), &worth(), &faults).unwrap();
             let dense = found(&rewards(advantage, 0.3), &worth(), &faults).unwrap();
@@ -225,9 +236,13 @@ mod tests {
                 close(change(0, at), -0.2);
                 close(change(1, at), 0.1);
             }
-            close(change(2, 0), -0.2);
-            close(change(0, 0), 0.1);
-            close(change(2, 1), 0.0);
+            // Of the first two moves of the first agents: 0, -1, -1 and 0, -1, 0, less their means.
+            close(change(0, 0), 0.2);
+            close(change(1, 0), -0.1);
+            close(change(2, 0), -0.1);
+            close(change(0, 1), 0.1);
+            close(change(1, 1), -0.2);
+            close(change(2, 1), 0.1);
         }
         // It is enough on its own to compare futures that realism does not tell apart.
         let equal = LeaveOneOut {

@@ -1,12 +1,14 @@
 //! Reinforcement learning from rollouts: the contribution of a rollout to the realism of its group
 //! is the reward.
 //!
-//! Futures of a scene are drawn by the network without rules and compared with the log by the
-//! metric of Waymo's Sim Agents Challenge. The contribution of each (its leave-one-out value) is
+//! Futures of a scene are drawn by the network without rules, with the lights of the log, and compared
+//! with the log by the metric of Waymo's Sim Agents Challenge. The contribution of each (its leave-one-out value) is
 //! the reward, as in RLFTSim (Ahmadi et al., "RLFTSim: Realistic and Controllable Multi-Agent
 //! Traffic Simulation via Reinforcement Learning Fine-Tuning", CVPR 2026), here split by agent and
 //! step: the return of a move is the sum of later rewards. Moves with a higher return than those of
 //! the other futures become more likely, the others less likely.
+
+use std::sync::Arc;
 
 use gump_engine::Routes;
 use gump_engine::relative::{MAP_M, RelativeSampling, RelativeWorld};
@@ -16,6 +18,7 @@ use gump_model::relative::sample::{Sample, whole};
 use gump_model::steps::{TOKEN_DT, stride_of};
 use gump_rollout::{SimulateConfig, Start, simulate};
 use gump_scene::{AgentId, Frame, Rollout, Scenario, Seed};
+use gump_traffic::{LightControl, Living, LivingConfig, RecordedLights};
 use gump_wosac::realism::{Config, LeaveOneOut, Log, Mode, Reference, Rollouts, Year};
 use serde::Serialize;
 
@@ -86,7 +89,13 @@ impl Judged {
             n_futures: self.config.rollouts,
             seed,
         };
-        let futures = simulate(&self.world, &[start], None, &SimulateConfig::default())
+        // The metric judges by the lights of the log whether a red light was passed.
+        let surroundings = LivingConfig {
+            lights: LightControl::Recorded(Arc::new(RecordedLights::of(&scenario))),
+            arrivals: None,
+        };
+        let world = Living::new(&self.world, surroundings);
+        let futures = simulate(&world, &[start], None, &SimulateConfig::default())
             .map_err(|error| TrainError::Rollout(format!("{}: {error}", scenario.id).into()))?;
         let Ok(rollouts) = Rollouts::of(&scenario.id, &futures, Mode::SimAgents) else {
             return Ok(None);

@@ -20,9 +20,10 @@ pub struct RelativeRewards {
     pub refresh: usize,
     /// What a move is credited with.
     pub advantage: Advantage,
-    /// Weight of a penalty for collisions and for leaving the road, at least 0: by how many standard
-    /// deviations of the group the advantage of a move falls for each of the two that its agent
-    /// first commits in this move or later. As in the metric, also where the log does the same.
+    /// Weight of a penalty for collisions, for leaving the road and for passing red lights, at least
+    /// 0: by how many standard deviations of the group the advantage of a move falls for each of the
+    /// three that its agent first commits in this move or later. As in the metric, also where the log
+    /// does the same.
     pub dense: f64,
     /// Divergence from the network at the start of the run that is aimed at, nats a move, above 0;
     /// without it there is no such term. Its weight in the loss adapts, as in PPO with a penalty
