@@ -105,9 +105,7 @@ pub(crate) fn generate<'py>(
     for first in (0..wish.count).step_by(BATCH as usize) {
         py.check_signals()?;
         let numbers = first..(first + BATCH).min(wish.count);
-        let checked = threads::work(py, || {
-            make_many(worlds, &order, numbers, Seed(wish.seed))
-        })?;
+        let checked = threads::work(py, || make_many(worlds, &order, numbers, Seed(wish.seed)))?;
         for checked in checked.map_err(errors::value)? {
             list.append(scene_dict(py, checked.map_err(errors::runtime)?)?)?;
         }
