@@ -337,7 +337,10 @@ fn the_recorded_stages_of_the_relative_network_can_be_run() {
     for (name, out) in [
         ("relative-rewards.toml", "rewards"),
         ("relative-10.toml", "ten"),
-        ("relative-11.toml", "eleven"),
+        (
+            "relative-11.toml",
+            "eleven --from further/weights.safetensors",
+        ),
     ] {
         on_these(name);
         place.fails(

@@ -2,8 +2,8 @@
 //! is the reward.
 //!
 //! Futures of a scene are drawn by the network without rules, with the lights of the log, and compared
-//! with the log by the metric of Waymo's Sim Agents Challenge. The contribution of each (its leave-one-out value) is
-//! the reward, as in RLFTSim (Ahmadi et al., "RLFTSim: Realistic and Controllable Multi-Agent
+//! with the log by the metric of Waymo's Sim Agents Challenge. The contribution of each (its
+//! leave-one-out value) is the reward, as in RLFTSim (Ahmadi et al., "RLFTSim: Realistic and Controllable Multi-Agent
 //! Traffic Simulation via Reinforcement Learning Fine-Tuning", CVPR 2026), here split by agent and
 //! step: the return of a move is the sum of later rewards. Moves with a higher return than those of
 //! the other futures become more likely, the others less likely.
@@ -84,19 +84,7 @@ impl Judged {
         let Ok(log) = Log::of(&scenario) else {
             return Ok(None);
         };
-        let start = Start {
-            scene: scenario.present().unguided(),
-            n_futures: self.config.rollouts,
-            seed,
-        };
-        // The metric judges by the lights of the log whether a red light was passed.
-        let surroundings = LivingConfig {
-            lights: LightControl::Recorded(Arc::new(RecordedLights::of(&scenario))),
-            arrivals: None,
-        };
-        let world = Living::new(&self.world, surroundings);
-        let futures = simulate(&world, &[start], None, &SimulateConfig::default())
-            .map_err(|error| TrainError::Rollout(format!("{}: {error}", scenario.id).into()))?;
+        let futures = self.imagine(&scenario, seed)?;
         let Ok(rollouts) = Rollouts::of(&scenario.id, &futures, Mode::SimAgents) else {
             return Ok(None);
         };
@@ -127,6 +115,29 @@ impl Judged {
             realism,
             excluded,
         }))
+    }
+
+    /// Futures of a scene as they are judged: without rules, with the lights of the log, by which the
+    /// metric tells who passes at red.
+    ///
+    /// Error: errors of the rollout.
+    pub(super) fn imagine(
+        &self,
+        scenario: &Scenario,
+        seed: Seed,
+    ) -> Result<Vec<Rollout>, TrainError> {
+        let surroundings = LivingConfig {
+            lights: LightControl::Recorded(Arc::new(RecordedLights::of(scenario))),
+            arrivals: None,
+        };
+        let world = Living::new(&self.world, surroundings);
+        let start = Start {
+            scene: scenario.present().unguided(),
+            n_futures: self.config.rollouts,
+            seed,
+        };
+        simulate(&world, &[start], None, &SimulateConfig::default())
+            .map_err(|error| TrainError::Rollout(format!("{}: {error}", scenario.id).into()))
     }
 }
 

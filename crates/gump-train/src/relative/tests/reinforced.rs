@@ -3,6 +3,8 @@
 
 use std::path::Path;
 
+use gump_scene::{Frame, LightState};
+
 use super::*;
 use crate::TrainError;
 
@@ -152,6 +154,36 @@ fn a_resumed_run_stays_near_the_same_network() {
     let plain = folder.path().join("plain");
     trainer(6, other).save(&plain).unwrap();
     assert!(archive(&plain).take(checkpoint::REFERENCE).is_empty());
+}
+
+/// Who passes at red is judged by the log's lights, which rollouts therefore show.
+#[test]
+fn rewarded_rollouts_show_the_lights_of_the_log() {
+    let text = "lane 1: 0,0 40,0 next 2\nlane 2: 40,0 90,0\nlight 2 red: 40,0\nego vehicle 0: 30,0";
+    let mut scenario = fixture::scenario(text).unwrap();
+    let changes = scenario.now + 22;
+    for frame in &mut scenario.log[changes..] {
+        let mut lights = frame.lights().to_vec();
+        lights[0].state = LightState::Green;
+        *frame = Frame::new(frame.agents().to_vec(), lights);
+    }
+    let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
+    let judged = rewards::Judged::new(&network, &rewards()).unwrap();
+    let futures = judged.imagine(&scenario, Seed(2)).unwrap();
+    assert_eq!(futures.len(), 3);
+    for future in &futures {
+        // The world steps every fifth frame.
+        let steps = future.imagined().iter().zip(scenario.future()).skip(4);
+        let (mut red, mut green) = (0, 0);
+        for (shown, logged) in steps.step_by(5) {
+            assert_eq!(shown.lights(), logged.lights());
+            match shown.lights()[0].state {
+                LightState::Green => green += 1,
+                _ => red += 1,
+            }
+        }
+        assert_eq!((red, green), (4, 12));
+    }
 }
 
 /// All moves of a future have one weight, or each agent and move its own; a dense term lowers those
