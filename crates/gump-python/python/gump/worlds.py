@@ -210,8 +210,8 @@ def generate(
     objects as TOML text. `seconds` of every scene's future are simulated. `anywhere` lets the ego start
     on any lane around there; `guided` puts objects on lanes and walkways only.
 
-    Raises `ValueError` for an unknown tag, contradicting wishes and numbers out of range,
-    `RuntimeError` if a scene cannot be made.
+    Raises `ValueError` for an unknown tag, contradicting wishes, numbers out of range and worlds that
+    cannot do this, `RuntimeError` if a scene cannot be made.
 
     `world` is a sequence network, the only kind that makes scenes; by default the one that comes with
     the package. `traffic` simulates the seconds that follow, and the moments at which prompts are
