@@ -34,7 +34,8 @@ pub enum TrainError {
     /// No scene can be compared with its log, as rewards of realism need.
     #[error(
         "configuration: realism: no scene has the second of past and the eight seconds of future \
-         at 10 Hz, the road edges and the agents that its rollouts are compared with"
+         at 10 Hz, the road edges and the agents that its rollouts are compared with, or none of \
+         those has the lights that lit asks for"
     )]
     NoComparableScene,
     /// Training diverged.

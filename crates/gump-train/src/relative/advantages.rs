@@ -1,5 +1,6 @@
 //! From the worth of rollouts to the advantage of each of their moves.
 
+use gump_scene::{Agent, AgentId, AgentKind, Rollout};
 use gump_wosac::realism::{Component, Evaluation, LeaveOneOut};
 
 use crate::relative::settings::{Advantage, RelativeRewards};
@@ -24,9 +25,50 @@ const FAULTS: [Component; 3] = [
     Component::TrafficLightViolation,
 ];
 
-/// The faults that the metric finds in the futures of an evaluation.
-pub(super) fn faults(evaluation: &Evaluation<'_>) -> Faults {
-    FAULTS.map(|fault| evaluation.first_indications(fault))
+/// The faults that the metric finds in the futures of the agents of an evaluation, without those that
+/// the same agent commits in its log: driveways are behind the edge of the road. Overlaps between
+/// people are left out as well, as recordings have them: people walk side by side.
+pub(super) fn faults(
+    evaluation: &Evaluation<'_>,
+    agents: &[AgentId],
+    futures: &[Rollout],
+) -> Faults {
+    let found = FAULTS.map(|fault| {
+        let (in_log, _) = evaluation.indications(fault);
+        let mut firsts = evaluation.first_indications(fault);
+        for own in &mut firsts {
+            for (first, in_log) in own.iter_mut().zip(&in_log) {
+                *first = first.filter(|_| !in_log);
+            }
+        }
+        firsts
+    });
+    let [mut collisions, exits, reds] = found;
+    for (future, own) in futures.iter().zip(&mut collisions) {
+        for (id, first) in agents.iter().zip(own) {
+            *first = first.and_then(|first| first_not_among_people(future, *id, first));
+        }
+    }
+    [collisions, exits, reds]
+}
+
+/// The first scored step, from one on, at which an agent overlaps another unless both are people.
+fn first_not_among_people(future: &Rollout, id: AgentId, from: usize) -> Option<usize> {
+    let is_person = |agent: &Agent| agent.kind == AgentKind::Pedestrian;
+    let mut steps = future.imagined().iter().enumerate().skip(from);
+    let found = steps.find(|(_, frame)| {
+        let Some(own) = frame.agent(id) else {
+            return false;
+        };
+        // Of others the metric is believed: it rounds the corners of boxes.
+        !is_person(own)
+            || frame.agents().iter().any(|other| {
+                other.id != id
+                    && !is_person(other)
+                    && other.oriented_box().overlaps(&own.oriented_box())
+            })
+    });
+    found.map(|(step, _)| step)
 }
 
 /// The advantage of every move of the scored agents; `None` if all futures are equally good.
@@ -145,8 +187,6 @@ fn clipped(mut all: ByMove) -> ByMove {
 
 #[cfg(test)]
 mod tests {
-    use gump_scene::AgentId;
-
     use super::*;
 
     /// Two agents with four steps, two moves each.
@@ -253,6 +293,32 @@ mod tests {
         close(alone[0][3], -0.2);
         let scene = rewards(Advantage::Scene, 0.3);
         assert!(found(&scene, &equal, &nobody()).is_none());
+    }
+
+    /// Two people walk into each other, and then one of them into a vehicle.
+    #[test]
+    fn people_who_overlap_each_other_are_not_at_fault() {
+        let text = "lane 1: 0,0 60,0\nego vehicle 0: 10,0\nagent pedestrian 1: 20,0
+             agent pedestrian 2: 20,0.5\nagent vehicle 3: 10,0.5";
+        let scenario = gump_scene::fixture::scenario(text).unwrap();
+        let mut future = Rollout::begin(scenario.present());
+        let now = &scenario.log[scenario.now];
+        for k in 0..6 {
+            // The first one is between ego and second until it is inside the ego.
+            let moved = now.agents().iter().map(|agent| {
+                let mut agent = *agent;
+                if agent.id == AgentId(1) && k >= 4 {
+                    agent.state.pose.position.x = 10.0;
+                }
+                agent
+            });
+            future.push(gump_scene::Frame::new(moved.collect(), Vec::new()));
+        }
+        let first = |id, from| first_not_among_people(&future, AgentId(id), from);
+        assert_eq!((first(1, 0), first(1, 5)), (Some(4), Some(5)));
+        assert_eq!(first(2, 0), None);
+        // Others are as the metric says.
+        assert_eq!((first(0, 2), first(3, 0)), (Some(2), Some(0)));
     }
 
     #[test]

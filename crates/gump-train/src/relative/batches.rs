@@ -7,6 +7,7 @@ use std::sync::mpsc::{Receiver, channel};
 use gump_model::relative::RelativeNetwork;
 use gump_model::relative::sample::{Sample, SampleConfig, draw};
 use gump_scene::Seed;
+use rand::Rng as _;
 
 use crate::TrainError;
 use crate::relative::drives::NetworkDriver;
@@ -18,6 +19,8 @@ use crate::scenes::ScenarioSource;
 const ATTEMPTS: u64 = 64;
 /// Separates the scenes to roll out from those of the samples.
 const GROUP: u64 = 1 << 40;
+/// Separates from these whether the scene has to have lights.
+const LIT: u64 = 1 << 41;
 
 /// The data of a step, or the error of drawing it.
 pub(super) type BatchReceiver = Receiver<Result<Batch, TrainError>>;
@@ -93,14 +96,20 @@ impl BatchSource {
 
     fn group(&self, step: usize, judged: &Judged) -> Result<Group, TrainError> {
         let seed = self.seed.fork(step as u64).fork(GROUP);
+        let lit = seed.fork(LIT).rng().random_bool(judged.lit());
+        let mut excluded = 0;
         for attempt in 0..ATTEMPTS {
             let seed = seed.fork(attempt);
             let scenario = self.scenarios.pick(step, seed.fork(0).0);
             let scenario = self.scenarios.get(scenario)?;
+            if lit && scenario.log[scenario.now].lights().is_empty() {
+                continue;
+            }
             if let Some(mut group) = judged.group(&scenario, seed.fork(1))? {
-                group.excluded.scenes = attempt as usize;
+                group.excluded.scenes = excluded;
                 return Ok(group);
             }
+            excluded += 1;
         }
         Err(TrainError::NoComparableScene)
     }

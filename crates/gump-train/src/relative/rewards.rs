@@ -70,6 +70,11 @@ impl Judged {
         })
     }
 
+    /// Share of the groups that are drawn among scenes with traffic lights.
+    pub(super) fn lit(&self) -> f64 {
+        self.config.lit
+    }
+
     /// Rolls a scene out and computes returns; `None` for a scene for which realism is not defined
     /// (too short, without road edges, with another time step) or in which all futures have equal
     /// rewards.
@@ -108,7 +113,8 @@ impl Judged {
         let worth = &worth;
         let per_move = (TOKEN_DT / scenario.dt).round() as usize;
         let found = (realism, worth);
-        let earnings = advantages(&self.config, found, &faults(&evaluation), per_move);
+        let faults = faults(&evaluation, &worth.agents, &futures);
+        let earnings = advantages(&self.config, found, &faults, per_move);
         let samples = earnings.and_then(|earned| judged(&scenario, &futures, worth, &earned));
         Ok(samples.map(|samples| Group {
             samples,

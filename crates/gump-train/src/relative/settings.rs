@@ -22,9 +22,12 @@ pub struct RelativeRewards {
     pub advantage: Advantage,
     /// Weight of a penalty for collisions, for leaving the road and for passing red lights, at least
     /// 0: by how many standard deviations of the group the advantage of a move falls for each of the
-    /// three that its agent first commits in this move or later. As in the metric, also where the log
-    /// does the same.
+    /// three that its agent first commits in this move or later and does not commit in the log.
+    /// People who overlap each other do not collide here.
     pub dense: f64,
+    /// Share of the groups that are drawn among scenes with traffic lights, 0 to 1; the others are
+    /// drawn among all.
+    pub lit: f64,
     /// Divergence from the network at the start of the run that is aimed at, nats a move, above 0;
     /// without it there is no such term. Its weight in the loss adapts, as in PPO with a penalty
     /// (Schulman et al., "Proximal Policy Optimization Algorithms", 2017, section 4): every
@@ -63,6 +66,7 @@ impl Default for RelativeRewards {
             refresh: 10,
             advantage: Advantage::Agent,
             dense: 0.0,
+            lit: 0.0,
             kl_target: None,
             kl_weight: 1.0,
             kl_bound: None,
@@ -95,6 +99,9 @@ impl RelativeRewards {
         }
         if !self.dense.is_finite() || self.dense < 0.0 {
             return fail("realism.dense", "dense must be at least 0");
+        }
+        if !(0.0..=1.0).contains(&self.lit) {
+            return fail("realism.lit", "lit must be between 0 and 1");
         }
         match self.wrong_divergence() {
             Some((key, what)) => fail(key, &what),
@@ -163,6 +170,10 @@ mod tests {
         assert_eq!(
             with(|rewards| rewards.dense = -1.0),
             "configuration: realism: dense must be at least 0"
+        );
+        assert_eq!(
+            with(|rewards| rewards.lit = 1.1),
+            "configuration: realism: lit must be between 0 and 1"
         );
         let odd: Result<RelativeRewards, _> = serde_json::from_str("{\"advantage\": \"team\"}");
         let message = odd.unwrap_err().to_string();

@@ -186,6 +186,40 @@ fn rewarded_rollouts_show_the_lights_of_the_log() {
     }
 }
 
+/// The second scene cannot be compared with its log, so that it is counted where it is drawn.
+#[test]
+fn groups_are_of_scenes_with_lights_where_that_is_asked() {
+    let dark = fixture::scenario("lane 1: 0,0 60,0\nego vehicle 0: 10,0 velocity 8,0").unwrap();
+    let text = "lane 1: 0,0 40,0 next 2\nlane 2: 40,0 90,0\nedge: 0,-3 90,-3
+        light 2 red: 40,0\nego vehicle 0: 20,0 velocity 5,0";
+    let lit = fixture::scenario(text).unwrap();
+    let run = |share, scenes| {
+        let rewards = RelativeRewards {
+            lit: share,
+            ..rewards()
+        };
+        let train = RelativeTrainConfig {
+            realism: Some(rewards),
+            ..train_config(3)
+        };
+        let mut trainer = RelativeTrainer::new(config(), train, scenes, &Device::Cpu)?;
+        for _ in 0..3 {
+            trainer.step()?;
+        }
+        Ok::<_, TrainError>(trainer.reward_exclusions().scenes)
+    };
+    let both = || vec![dark.clone(), dark.clone(), dark.clone(), lit.clone()];
+    assert_eq!(run(1.0, both()).unwrap(), 0);
+    assert!(run(0.0, both()).unwrap() > 0);
+    let error = run(1.0, vec![scenario()]).unwrap_err();
+    assert!(matches!(error, TrainError::NoComparableScene), "{error}");
+    let message = error.to_string();
+    assert!(
+        message.ends_with("the lights that lit asks for"),
+        "{message}"
+    );
+}
+
 /// All moves of a future have one weight, or each agent and move its own; a dense term lowers those
 /// of agents that leave the road before they do.
 #[test]
@@ -235,4 +269,31 @@ fn moves_are_weighted_as_the_settings_say() {
         let quarters = f64::from(change) / 0.025;
         assert!((quarters - quarters.round()).abs() < 1e-3, "{change}");
     }
+}
+
+/// What an agent does in its log is no fault of its futures.
+#[test]
+fn who_leaves_the_road_in_the_log_may_do_so() {
+    let network = RelativeNetwork::random(config(), Seed(4), &Device::Cpu).unwrap();
+    let text = "lane 1: 0,0 90,0\nedge: 0,-2 90,-2\nego vehicle 0: 20,0 velocity 8,0";
+    let keeps = fixture::scenario(text).unwrap();
+    let mut leaves = keeps.clone();
+    for frame in &mut leaves.log[keeps.now + 40..] {
+        let mut agents = frame.agents().to_vec();
+        agents[0].state.pose.position.y -= 20.0;
+        *frame = Frame::new(agents, Vec::new());
+    }
+    let weights = |scenario: &Scenario, dense| -> Vec<f32> {
+        let rewards = RelativeRewards {
+            rollouts: 6,
+            dense,
+            ..RelativeRewards::default()
+        };
+        let judged = rewards::Judged::new(&network, &rewards).unwrap();
+        let samples = judged.group(scenario, Seed(2)).unwrap().unwrap().samples;
+        let targets = samples.iter().flat_map(|sample| &sample.targets);
+        targets.map(|target| target.weight).collect()
+    };
+    assert_ne!(weights(&keeps, 0.5), weights(&keeps, 0.0));
+    assert_eq!(weights(&leaves, 0.5), weights(&leaves, 0.0));
 }
