@@ -1,6 +1,7 @@
 //! From the worth of rollouts to the advantage of each of their moves.
 
-use gump_scene::{Agent, AgentId, AgentKind, Rollout};
+use gump_metrics::behaviour::{Behaviour, Measure, Seen};
+use gump_scene::{Agent, AgentId, AgentKind, Rollout, Scenario};
 use gump_wosac::realism::{Component, Evaluation, LeaveOneOut};
 
 use crate::relative::settings::{Advantage, RelativeRewards};
@@ -8,48 +9,107 @@ use crate::relative::settings::{Advantage, RelativeRewards};
 /// Advantages are clipped to this many standard deviations, so that rare ones do not outweigh a
 /// batch. Chosen by hand.
 const MOST: f64 = 3.0;
+/// Seconds that are judged: as many as the metric scores.
+const HORIZON_S: u32 = 8;
 /// Differences of returns smaller than this are rounding and ignored, in units of the metametric.
 const LEAST: f64 = 1e-9;
 
 /// Numbers of the moves of each future, `[future][agent, move]`.
 pub(super) type ByMove = Vec<Vec<f64>>;
 
-/// The scored steps at which agents first collide, first leave the road and first pass a red light,
-/// per future and agent.
-pub(super) type Faults = [Vec<Vec<Option<usize>>>; FAULTS.len()];
+/// Where agents first commit a fault.
+pub(super) struct Fault {
+    /// By how many standard deviations it lowers the advantages of the moves before it.
+    pub(super) weight: f64,
+    /// The scored step, per future and agent.
+    pub(super) first: Vec<Vec<Option<usize>>>,
+}
 
-/// What the dense term is for.
-const FAULTS: [Component; 3] = [
+/// Faults that the metric knows, all of weight [`RelativeRewards::dense`].
+const MEASURED: [Component; 3] = [
     Component::Collision,
     Component::Offroad,
     Component::TrafficLightViolation,
 ];
 
-/// The faults that the metric finds in the futures of the agents of an evaluation, without those that
-/// the same agent commits in its log: driveways are behind the edge of the road. Overlaps between
-/// people are left out as well, as recordings have them: people walk side by side.
+/// Faults of weight [`RelativeRewards::conduct`]. What an agent cannot know is none: whether who
+/// stands will stand throughout the log.
+const CONDUCT: [Measure; 3] = [
+    Measure::FreeRoadStop,
+    Measure::HardAcceleration,
+    Measure::Slip,
+];
+
+/// The faults in the futures of the agents of an evaluation, without those that the same agent
+/// commits in its log: driveways are behind the edge of the road. Overlaps between people are left
+/// out as well, as recordings have them: people walk side by side.
 pub(super) fn faults(
+    rewards: &RelativeRewards,
     evaluation: &Evaluation<'_>,
     agents: &[AgentId],
+    scenario: &Scenario,
     futures: &[Rollout],
-) -> Faults {
-    let found = FAULTS.map(|fault| {
-        let (in_log, _) = evaluation.indications(fault);
-        let mut firsts = evaluation.first_indications(fault);
-        for own in &mut firsts {
-            for (first, in_log) in own.iter_mut().zip(&in_log) {
-                *first = first.filter(|_| !in_log);
+) -> Vec<Fault> {
+    let mut faults = Vec::new();
+    if rewards.dense > 0.0 {
+        faults.extend(MEASURED.map(|component| Fault {
+            weight: rewards.dense,
+            first: measured(evaluation, component, agents, futures),
+        }));
+    }
+    if rewards.conduct > 0.0 {
+        faults.extend(conduct(scenario, agents, futures).map(|first| Fault {
+            weight: rewards.conduct,
+            first,
+        }));
+    }
+    faults
+}
+
+fn measured(
+    evaluation: &Evaluation<'_>,
+    component: Component,
+    agents: &[AgentId],
+    futures: &[Rollout],
+) -> Vec<Vec<Option<usize>>> {
+    let (in_log, _) = evaluation.indications(component);
+    let mut firsts = evaluation.first_indications(component);
+    for (own, future) in firsts.iter_mut().zip(futures) {
+        for (at, first) in own.iter_mut().enumerate() {
+            *first = first.filter(|_| !in_log[at]);
+            if component == Component::Collision {
+                *first = first.and_then(|first| first_not_among_people(future, agents[at], first));
             }
         }
-        firsts
-    });
-    let [mut collisions, exits, reds] = found;
-    for (future, own) in futures.iter().zip(&mut collisions) {
-        for (id, first) in agents.iter().zip(own) {
-            *first = first.and_then(|first| first_not_among_people(future, *id, first));
-        }
     }
-    [collisions, exits, reds]
+    firsts
+}
+
+fn conduct(
+    scenario: &Scenario,
+    agents: &[AgentId],
+    futures: &[Rollout],
+) -> [Vec<Vec<Option<usize>>>; CONDUCT.len()] {
+    let behaviour = Behaviour::new(scenario, HORIZON_S);
+    let log = behaviour.log();
+    let seen: Vec<Seen> = futures.iter().map(|future| behaviour.of(future)).collect();
+    // Incidents are sorted by time.
+    let first = |seen: &Seen, measure: Measure, id: AgentId| {
+        let mut incidents = seen.incidents.iter();
+        let found = incidents.find(|one| one.measure == measure && one.agent == id)?;
+        // The first step is one `dt` after the present.
+        Some(((found.at_s / scenario.dt).round() as usize).saturating_sub(1))
+    };
+    CONDUCT.map(|measure| {
+        let of_future = |seen: &Seen| {
+            let own = agents.iter().map(|&id| {
+                let in_log = first(&log, measure, id).is_some();
+                first(seen, measure, id).filter(|_| !in_log)
+            });
+            own.collect()
+        };
+        seen.iter().map(of_future).collect()
+    })
 }
 
 /// The first scored step, from one on, at which an agent overlaps another unless both are people.
@@ -74,12 +134,12 @@ fn first_not_among_people(future: &Rollout, id: AgentId, from: usize) -> Option<
 /// The advantage of every move of the scored agents; `None` if all futures are equally good.
 /// `realism` is the metametric of all futures, `per_move` the number of scored steps of a move.
 ///
-/// The returns of the futures minus their mean, in standard deviations of the group; a dense term
-/// is added in that unit, less its own mean over the futures.
+/// The returns of the futures minus their mean, in standard deviations of the group; faults are
+/// subtracted in that unit, less their own mean over the futures.
 pub(super) fn advantages(
     rewards: &RelativeRewards,
     (realism, worth): (f64, &LeaveOneOut),
-    faults: &Faults,
+    faults: &[Fault],
     per_move: usize,
 ) -> Option<ByMove> {
     let n_moves = worth.n_steps / per_move;
@@ -92,16 +152,20 @@ pub(super) fn advantages(
         }
     };
     let credited = standardized(returns);
-    if rewards.dense == 0.0 {
+    if faults.is_empty() {
         return Some(clipped(credited?));
     }
-    let (mut penalties, differ) = centred(penalties(faults, n_moves, per_move));
+    let (n_futures, n_agents) = (worth.credit.len(), worth.agents.len());
+    let penalties = (0..n_futures).map(|future| {
+        let of_agent = |agent| penalties(faults, (future, agent), n_moves, per_move);
+        (0..n_agents).flat_map(of_agent).collect()
+    });
+    let (mut penalties, differ) = centred(penalties.collect());
     if credited.is_none() && differ == 0.0 {
         return None;
     }
     for (i, own) in penalties.iter_mut().enumerate() {
         for (at, penalty) in own.iter_mut().enumerate() {
-            *penalty *= rewards.dense;
             *penalty += credited.as_ref().map_or(0.0, |credited| credited[i][at]);
         }
     }
@@ -129,26 +193,23 @@ fn to_go(credit: &[f64], per_move: usize) -> Vec<f64> {
     earned
 }
 
-/// For each move minus one for each fault that its agent first commits in it or later.
-fn penalties(faults: &Faults, n_moves: usize, per_move: usize) -> ByMove {
-    let of_agent = |firsts: [Option<usize>; FAULTS.len()]| {
-        let mut rewards = vec![0.0; n_moves * per_move];
-        for step in firsts.into_iter().flatten() {
-            // Steps after the last whole move belong to none.
-            if let Some(reward) = rewards.get_mut(step) {
-                *reward -= 1.0;
-            }
+/// For each move of an agent of a future minus the weight of each fault that it first commits in this
+/// move or later.
+fn penalties(
+    faults: &[Fault],
+    (future, agent): (usize, usize),
+    n_moves: usize,
+    per_move: usize,
+) -> Vec<f64> {
+    let mut rewards = vec![0.0; n_moves * per_move];
+    for fault in faults {
+        let first = fault.first[future][agent];
+        // Steps after the last whole move belong to none.
+        if let Some(reward) = first.and_then(|step| rewards.get_mut(step)) {
+            *reward -= fault.weight;
         }
-        to_go(&rewards, per_move)
-    };
-    let [collisions, ..] = faults;
-    let of_future = |i: usize| {
-        let agents = 0..collisions[i].len();
-        agents
-            .flat_map(|agent| of_agent(faults.each_ref().map(|fault| fault[i][agent])))
-            .collect()
-    };
-    (0..collisions.len()).map(of_future).collect()
+    }
+    to_go(&rewards, per_move)
 }
 
 /// Less the mean over the futures; with the sum of squares that is left.
@@ -205,18 +266,22 @@ mod tests {
 
     const REALISM: f64 = 0.58;
 
-    fn nobody() -> Faults {
-        std::array::from_fn(|_| vec![vec![None; 2]; 3])
+    /// Nobody's faults, of two kinds.
+    fn nobody(weights: [f64; 2]) -> Vec<Fault> {
+        let of = |weight| Fault {
+            weight,
+            first: vec![vec![None; 2]; 3],
+        };
+        weights.map(of).into()
     }
 
-    fn found(rewards: &RelativeRewards, worth: &LeaveOneOut, faults: &Faults) -> Option<ByMove> {
+    fn found(rewards: &RelativeRewards, worth: &LeaveOneOut, faults: &[Fault]) -> Option<ByMove> {
         advantages(rewards, (REALISM, worth), faults, 2)
     }
 
-    fn rewards(advantage: Advantage, dense: f64) -> RelativeRewards {
+    fn rewards(advantage: Advantage) -> RelativeRewards {
         RelativeRewards {
             advantage,
-            dense,
             ..RelativeRewards::default()
         }
     }
@@ -227,7 +292,7 @@ mod tests {
 
     #[test]
     fn moves_of_an_agent_are_credited_with_what_follows() {
-        let found = found(&rewards(Advantage::Agent, 0.0), &worth(), &nobody()).unwrap();
+        let found = found(&rewards(Advantage::Agent), &worth(), &[]).unwrap();
         let returns = [
             [0.3, 0.2, 0.2, 0.2],
             [0.0, -0.1, 0.2, 0.0],
@@ -243,7 +308,7 @@ mod tests {
 
     #[test]
     fn moves_of_a_future_are_credited_with_its_worth() {
-        let found = found(&rewards(Advantage::Scene, 0.0), &worth(), &nobody()).unwrap();
+        let found = found(&rewards(Advantage::Scene), &worth(), &[]).unwrap();
         // What each future adds, less the mean; the others are worth 0.5, 0.6 and 0.55.
         let off = [0.05, -0.05, 0.0];
         let spread = (2.0 * 0.05f64.powi(2) / 3.0).sqrt();
@@ -255,21 +320,21 @@ mod tests {
             metametric: vec![0.5; 3],
             ..worth()
         };
-        let scene = rewards(Advantage::Scene, 0.0);
-        assert!(self::found(&scene, &equal, &nobody()).is_none());
+        let scene = rewards(Advantage::Scene);
+        assert!(self::found(&scene, &equal, &[]).is_none());
     }
 
     #[test]
     fn a_collision_lowers_the_advantages_of_the_moves_before_it() {
-        let mut faults = nobody();
-        // The second agent of the first future collides in its second move, and the first agents of
-        // the third and the second leave the road and pass a red light in their first and second.
-        faults[0][0][1] = Some(2);
-        faults[1][2][0] = Some(1);
-        faults[2][1][0] = Some(3);
+        // The second agent of the first future commits the first kind in its second move, the first
+        // agents of the third and the second the other in their first and second.
+        let mut faults = nobody([0.3, 0.6]);
+        faults[0].first[0][1] = Some(2);
+        faults[1].first[2][0] = Some(1);
+        faults[1].first[1][0] = Some(3);
         for advantage in [Advantage::Agent, Advantage::Scene] {
-            let plain = found(&rewards(advantage, 0.0), &worth(), &faults).unwrap();
-            let dense = found(&rewards(advantage, 0.3), &worth(), &faults).unwrap();
+            let plain = found(&rewards(advantage), &worth(), &[]).unwrap();
+            let dense = found(&rewards(advantage), &worth(), &faults).unwrap();
             let change = |i: usize, at: usize| dense[i][at] - plain[i][at];
             // Two thirds of the weight less than before; the other futures share what it lost.
             for at in [2, 3] {
@@ -277,22 +342,22 @@ mod tests {
                 close(change(1, at), 0.1);
             }
             // Of the first two moves of the first agents: 0, -1, -1 and 0, -1, 0, less their means.
-            close(change(0, 0), 0.2);
-            close(change(1, 0), -0.1);
-            close(change(2, 0), -0.1);
-            close(change(0, 1), 0.1);
-            close(change(1, 1), -0.2);
-            close(change(2, 1), 0.1);
+            close(change(0, 0), 0.4);
+            close(change(1, 0), -0.2);
+            close(change(2, 0), -0.2);
+            close(change(0, 1), 0.2);
+            close(change(1, 1), -0.4);
+            close(change(2, 1), 0.2);
         }
         // It is enough on its own to compare futures that realism does not tell apart.
         let equal = LeaveOneOut {
             metametric: vec![0.5; 3],
             ..worth()
         };
-        let alone = found(&rewards(Advantage::Scene, 0.3), &equal, &faults).unwrap();
+        let scene = rewards(Advantage::Scene);
+        let alone = found(&scene, &equal, &faults).unwrap();
         close(alone[0][3], -0.2);
-        let scene = rewards(Advantage::Scene, 0.3);
-        assert!(found(&scene, &equal, &nobody()).is_none());
+        assert!(found(&scene, &equal, &nobody([0.3, 0.3])).is_none());
     }
 
     /// Two people walk into each other, and then one of them into a vehicle.
@@ -321,11 +386,52 @@ mod tests {
         assert_eq!((first(0, 2), first(3, 0)), (Some(2), Some(0)));
     }
 
+    /// The ego slides to the left from the third second on, as another did in the log.
+    #[test]
+    fn who_slips_sideways_is_at_fault_unless_its_log_does() {
+        let text = "lane 1: 0,0 200,0\nego vehicle 0: 10,0 velocity 8,0
+             agent vehicle 1: 60,0 velocity 8,0\nagent vehicle 2: 100,0 velocity 8,0";
+        let mut scenario = gump_scene::fixture::scenario(text).unwrap();
+        let slide = |frame: &gump_scene::Frame, k: usize, who: &[i64]| {
+            let moved = frame.agents().iter().map(|agent| {
+                let mut agent = *agent;
+                if who.contains(&agent.id.0) {
+                    agent.state.pose.position.y += 0.2 * k.saturating_sub(30) as f64;
+                }
+                agent
+            });
+            gump_scene::Frame::new(moved.collect(), Vec::new())
+        };
+        let future = |who: &[i64]| {
+            let mut future = Rollout::begin(scenario.present());
+            let frames = scenario.future().iter().enumerate();
+            frames.for_each(|(k, frame)| future.push(slide(frame, k, who)));
+            future
+        };
+        let futures = [future(&[]), future(&[0, 1])];
+        let agents = [0, 1, 2].map(AgentId);
+        let [stops, hard, slips] = conduct(&scenario, &agents, &futures);
+        assert_eq!(stops, [[None; 3]; 2]);
+        assert_eq!(hard, [[None; 3]; 2]);
+        assert_eq!(slips[0], [None; 3]);
+        let [Some(one), Some(other), None] = slips[1][..] else {
+            panic!("{slips:?}");
+        };
+        // Velocity is measured over half a second.
+        assert!(one == other && (26..=31).contains(&one), "{one} {other}");
+        let start = scenario.now + 1;
+        for (k, frame) in scenario.log[start..].iter_mut().enumerate() {
+            *frame = slide(frame, k, &[1]);
+        }
+        let [.., slips] = conduct(&scenario, &agents, &futures);
+        assert_eq!(slips[1], [Some(one), None, None]);
+    }
+
     #[test]
     fn advantages_are_clipped() {
-        let mut faults = nobody();
-        faults[0][0][1] = Some(2);
-        let found = found(&rewards(Advantage::Agent, 100.0), &worth(), &faults).unwrap();
+        let mut faults = nobody([100.0, 0.0]);
+        faults[0].first[0][1] = Some(2);
+        let found = found(&rewards(Advantage::Agent), &worth(), &faults).unwrap();
         assert_eq!((found[0][2], found[1][2]), (-MOST, MOST));
     }
 }

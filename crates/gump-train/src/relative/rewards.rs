@@ -113,7 +113,8 @@ impl Judged {
         let worth = &worth;
         let per_move = (TOKEN_DT / scenario.dt).round() as usize;
         let found = (realism, worth);
-        let faults = faults(&evaluation, &worth.agents, &futures);
+        let (config, agents) = (&self.config, &worth.agents);
+        let faults = faults(config, &evaluation, agents, &scenario, &futures);
         let earnings = advantages(&self.config, found, &faults, per_move);
         let samples = earnings.and_then(|earned| judged(&scenario, &futures, worth, &earned));
         Ok(samples.map(|samples| Group {

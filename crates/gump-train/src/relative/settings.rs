@@ -25,6 +25,9 @@ pub struct RelativeRewards {
     /// three that its agent first commits in this move or later and does not commit in the log.
     /// People who overlap each other do not collide here.
     pub dense: f64,
+    /// The same for what a driver would notice: a stop on a free road, an acceleration beyond grip,
+    /// and a vehicle that slips sideways, as [`gump_metrics::behaviour`] counts them.
+    pub conduct: f64,
     /// Share of the groups that are drawn among scenes with traffic lights, 0 to 1; the others are
     /// drawn among all.
     pub lit: f64,
@@ -66,6 +69,7 @@ impl Default for RelativeRewards {
             refresh: 10,
             advantage: Advantage::Agent,
             dense: 0.0,
+            conduct: 0.0,
             lit: 0.0,
             kl_target: None,
             kl_weight: 1.0,
@@ -97,8 +101,17 @@ impl RelativeRewards {
         if !self.weight.is_finite() || self.weight <= 0.0 {
             return fail("realism.weight", "weight must be above 0");
         }
-        if !self.dense.is_finite() || self.dense < 0.0 {
-            return fail("realism.dense", "dense must be at least 0");
+        for (weight, key, what) in [
+            (self.dense, "realism.dense", "dense must be at least 0"),
+            (
+                self.conduct,
+                "realism.conduct",
+                "conduct must be at least 0",
+            ),
+        ] {
+            if !weight.is_finite() || weight < 0.0 {
+                return fail(key, what);
+            }
         }
         if !(0.0..=1.0).contains(&self.lit) {
             return fail("realism.lit", "lit must be between 0 and 1");
@@ -170,6 +183,10 @@ mod tests {
         assert_eq!(
             with(|rewards| rewards.dense = -1.0),
             "configuration: realism: dense must be at least 0"
+        );
+        assert_eq!(
+            with(|rewards| rewards.conduct = f64::NAN),
+            "configuration: realism: conduct must be at least 0"
         );
         assert_eq!(
             with(|rewards| rewards.lit = 1.1),
