@@ -17,12 +17,15 @@ const LEAST: f64 = 1e-9;
 /// Numbers of the moves of each future, `[future][agent, move]`.
 pub(super) type ByMove = Vec<Vec<f64>>;
 
-/// Where agents first commit a fault.
+/// The scored step at which each agent first commits a fault, `[future][agent]`; `None` where it never
+/// does.
+type Firsts = Vec<Vec<Option<usize>>>;
+
+/// A fault, and where agents first commit it.
 pub(super) struct Fault {
     /// By how many standard deviations it lowers the advantages of the moves before it.
     pub(super) weight: f64,
-    /// The scored step, per future and agent.
-    pub(super) first: Vec<Vec<Option<usize>>>,
+    pub(super) first: Firsts,
 }
 
 /// Faults that the metric knows, all of weight [`RelativeRewards::dense`].
@@ -71,7 +74,7 @@ fn measured(
     component: Component,
     agents: &[AgentId],
     futures: &[Rollout],
-) -> Vec<Vec<Option<usize>>> {
+) -> Firsts {
     let (in_log, _) = evaluation.indications(component);
     let mut firsts = evaluation.first_indications(component);
     for (own, future) in firsts.iter_mut().zip(futures) {
@@ -89,7 +92,7 @@ fn conduct(
     scenario: &Scenario,
     agents: &[AgentId],
     futures: &[Rollout],
-) -> [Vec<Vec<Option<usize>>>; CONDUCT.len()] {
+) -> [Firsts; CONDUCT.len()] {
     let behaviour = Behaviour::new(scenario, HORIZON_S);
     let log = behaviour.log();
     let seen: Vec<Seen> = futures.iter().map(|future| behaviour.of(future)).collect();

@@ -17,6 +17,8 @@ use crate::scenes::ScenarioSource;
 
 /// Maximum number of scenes tried for a sample: more mean that hardly any is long enough.
 const ATTEMPTS: u64 = 64;
+/// Maximum number of scenes drawn to find one with lights, which may be rare.
+const PICKS: u64 = 4096;
 /// Separates the scenes to roll out from those of the samples.
 const GROUP: u64 = 1 << 40;
 /// Separates from these whether the scene has to have lights.
@@ -98,8 +100,8 @@ impl BatchSource {
         let seed = self.seed.fork(step as u64).fork(GROUP);
         let lit = seed.fork(LIT).rng().random_bool(judged.lit());
         let mut excluded = 0;
-        for attempt in 0..ATTEMPTS {
-            let seed = seed.fork(attempt);
+        for pick in 0..PICKS {
+            let seed = seed.fork(pick);
             let scenario = self.scenarios.pick(step, seed.fork(0).0);
             let scenario = self.scenarios.get(scenario)?;
             if lit && scenario.log[scenario.now].lights().is_empty() {
@@ -110,6 +112,9 @@ impl BatchSource {
                 return Ok(group);
             }
             excluded += 1;
+            if excluded == ATTEMPTS as usize {
+                break;
+            }
         }
         Err(TrainError::NoComparableScene)
     }

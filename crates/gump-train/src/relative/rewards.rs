@@ -115,7 +115,7 @@ impl Judged {
         let found = (realism, worth);
         let (config, agents) = (&self.config, &worth.agents);
         let faults = faults(config, &evaluation, agents, &scenario, &futures);
-        let earnings = advantages(&self.config, found, &faults, per_move);
+        let earnings = advantages(config, found, &faults, per_move);
         let samples = earnings.and_then(|earned| judged(&scenario, &futures, worth, &earned));
         Ok(samples.map(|samples| Group {
             samples,

@@ -186,7 +186,7 @@ fn rewarded_rollouts_show_the_lights_of_the_log() {
     }
 }
 
-/// The second scene cannot be compared with its log, so that it is counted where it is drawn.
+/// The scene without lights cannot be compared with its log, so that it is counted where it is tried.
 #[test]
 fn groups_are_of_scenes_with_lights_where_that_is_asked() {
     let dark = fixture::scenario("lane 1: 0,0 60,0\nego vehicle 0: 10,0 velocity 8,0").unwrap();
@@ -211,6 +211,10 @@ fn groups_are_of_scenes_with_lights_where_that_is_asked() {
     let both = || vec![dark.clone(), dark.clone(), dark.clone(), lit.clone()];
     assert_eq!(run(1.0, both()).unwrap(), 0);
     assert!(run(0.0, both()).unwrap() > 0);
+    // One in three hundred is found as well.
+    let mut rare = vec![dark.clone(); 299];
+    rare.push(lit.clone());
+    assert_eq!(run(1.0, rare).unwrap(), 0);
     let error = run(1.0, vec![scenario()]).unwrap_err();
     assert!(matches!(error, TrainError::NoComparableScene), "{error}");
     let message = error.to_string();
