@@ -1,7 +1,7 @@
 //! From the worth of rollouts to the advantage of each of their moves.
 
 use gump_metrics::behaviour::{Behaviour, Measure, Seen};
-use gump_scene::{Agent, AgentId, AgentKind, Rollout, Scenario};
+use gump_scene::{AgentId, AgentKind, Rollout, Scenario};
 use gump_wosac::realism::{Component, Evaluation, LeaveOneOut};
 
 use crate::relative::settings::{Advantage, RelativeRewards};
@@ -44,8 +44,9 @@ const CONDUCT: [Measure; 3] = [
 ];
 
 /// The faults in the futures of the agents of an evaluation, without those that the same agent
-/// commits in its log: driveways are behind the edge of the road. Overlaps between people are left
-/// out as well, as recordings have them: people walk side by side.
+/// commits in its log: driveways are behind the edge of the road. Collisions of people are left out as
+/// well: recorded people walk side by side and close to vehicles, and with a penalty they stop before
+/// these.
 pub(super) fn faults(
     rewards: &RelativeRewards,
     evaluation: &Evaluation<'_>,
@@ -77,15 +78,19 @@ fn measured(
 ) -> Firsts {
     let (in_log, _) = evaluation.indications(component);
     let mut firsts = evaluation.first_indications(component);
+    let collides = component == Component::Collision;
     for (own, future) in firsts.iter_mut().zip(futures) {
-        for (at, first) in own.iter_mut().enumerate() {
-            *first = first.filter(|_| !in_log[at]);
-            if component == Component::Collision {
-                *first = first.and_then(|first| first_not_among_people(future, agents[at], first));
-            }
+        for ((first, &in_log), &id) in own.iter_mut().zip(&in_log).zip(agents) {
+            *first = first.filter(|_| !in_log && !(collides && is_person(future, id)));
         }
     }
     firsts
+}
+
+fn is_person(future: &Rollout, id: AgentId) -> bool {
+    let first = future.imagined().first();
+    let agent = first.and_then(|frame| frame.agent(id));
+    agent.is_some_and(|agent| agent.kind == AgentKind::Pedestrian)
 }
 
 fn conduct(
@@ -113,25 +118,6 @@ fn conduct(
         };
         seen.iter().map(of_future).collect()
     })
-}
-
-/// The first scored step, from one on, at which an agent overlaps another unless both are people.
-fn first_not_among_people(future: &Rollout, id: AgentId, from: usize) -> Option<usize> {
-    let is_person = |agent: &Agent| agent.kind == AgentKind::Pedestrian;
-    let mut steps = future.imagined().iter().enumerate().skip(from);
-    let found = steps.find(|(_, frame)| {
-        let Some(own) = frame.agent(id) else {
-            return false;
-        };
-        // Of others the metric is believed: it rounds the corners of boxes.
-        !is_person(own)
-            || frame.agents().iter().any(|other| {
-                other.id != id
-                    && !is_person(other)
-                    && other.oriented_box().overlaps(&own.oriented_box())
-            })
-    });
-    found.map(|(step, _)| step)
 }
 
 /// The advantage of every move of the scored agents; `None` if all futures are equally good.
@@ -251,6 +237,9 @@ fn clipped(mut all: ByMove) -> ByMove {
 
 #[cfg(test)]
 mod tests {
+    use gump_geometry::DVec2;
+    use gump_wosac::realism::{Config, Log, Mode, Reference, Rollouts, Year};
+
     use super::*;
 
     /// Two agents with four steps, two moves each.
@@ -363,30 +352,52 @@ mod tests {
         assert!(found(&scene, &equal, &nobody([0.3, 0.3])).is_none());
     }
 
-    /// Two people walk into each other, and then one of them into a vehicle.
+    /// A person walks into a vehicle, and a vehicle into another.
     #[test]
-    fn people_who_overlap_each_other_are_not_at_fault() {
-        let text = "lane 1: 0,0 60,0\nego vehicle 0: 10,0\nagent pedestrian 1: 20,0
-             agent pedestrian 2: 20,0.5\nagent vehicle 3: 10,0.5";
+    fn people_do_not_collide_and_vehicles_do() {
+        let text = "lane 1: 0,0 200,0\nedge: 0,-3 200,-3\nego vehicle 0: 10,0 velocity 8,0
+             agent vehicle 1: 100,0\nagent pedestrian 2: 95,6 velocity 0,0
+             agent vehicle 3: 95,10";
         let scenario = gump_scene::fixture::scenario(text).unwrap();
-        let mut future = Rollout::begin(scenario.present());
-        let now = &scenario.log[scenario.now];
-        for k in 0..6 {
-            // The first one is between ego and second until it is inside the ego.
-            let moved = now.agents().iter().map(|agent| {
-                let mut agent = *agent;
-                if agent.id == AgentId(1) && k >= 4 {
-                    agent.state.pose.position.x = 10.0;
-                }
-                agent
-            });
-            future.push(gump_scene::Frame::new(moved.collect(), Vec::new()));
-        }
-        let first = |id, from| first_not_among_people(&future, AgentId(id), from);
-        assert_eq!((first(1, 0), first(1, 5)), (Some(4), Some(5)));
-        assert_eq!(first(2, 0), None);
-        // Others are as the metric says.
-        assert_eq!((first(0, 2), first(3, 0)), (Some(2), Some(0)));
+        let future = |collides: bool| {
+            let mut future = Rollout::begin(scenario.present());
+            for (k, frame) in scenario.future().iter().enumerate() {
+                let moved = frame.agents().iter().map(|agent| {
+                    let mut agent = *agent;
+                    let to = match agent.id.0 {
+                        0 => DVec2::new(100.0, 0.0),
+                        2 => DVec2::new(95.0, 10.0),
+                        _ => agent.state.pose.position,
+                    };
+                    if collides && k >= 20 {
+                        agent.state.pose.position = to;
+                    }
+                    agent
+                });
+                future.push(gump_scene::Frame::new(moved.collect(), Vec::new()));
+            }
+            future
+        };
+        let futures = [future(false), future(true)];
+        let log = Log::of(&scenario).unwrap();
+        let metric = Config::of(Year::Y2025);
+        let reference = Reference::new(&log, &metric).unwrap();
+        let rollouts = Rollouts::of(&scenario.id, &futures, Mode::SimAgents).unwrap();
+        let evaluation = reference.evaluate(&rollouts).unwrap();
+        let agents = evaluation.leave_one_out().unwrap().agents;
+        let rewards = RelativeRewards {
+            dense: 0.5,
+            ..RelativeRewards::default()
+        };
+        let found = faults(&rewards, &evaluation, &agents, &scenario, &futures);
+        // Collisions are first.
+        let first = |future: usize, id: i64| {
+            let at = agents.iter().position(|agent| *agent == AgentId(id));
+            found[0].first[future][at.unwrap()]
+        };
+        assert_eq!((first(1, 0), first(1, 1)), (Some(20), Some(20)));
+        assert_eq!((first(1, 2), first(1, 3)), (None, Some(20)));
+        assert!([0, 1, 2, 3].iter().all(|id| first(0, *id).is_none()));
     }
 
     /// The ego slides to the left from the third second on, as another did in the log.

@@ -300,9 +300,12 @@ impl TrackDriver for NetworkDriver {
             true => tracks.iter().map(log_of).collect(),
             false => Vec::new(),
         };
-        for newcomer in logs.iter_mut().skip(n_logged) {
-            // Else a moving one would stop dead before a line: its later poses are placeholders.
-            newcomer.fill(None);
+        for (newcomer, track) in logs.iter_mut().zip(tracks.iter()).skip(n_logged) {
+            match (track.body.kind, track.is_obstacle) {
+                (AgentKind::Pedestrian, false) => walk_on(newcomer),
+                // Else a moving one would stop dead before a line: its later poses are placeholders.
+                _ => newcomer.fill(None),
+            }
         }
         let memory = self.engine.remember(map);
         let mut members: Vec<Option<ObservedAgent>> = tracks.iter().map(|_| None).collect();
@@ -590,6 +593,19 @@ impl NetworkDriver {
             bins.into_iter().map(dequantize).collect()
         });
         candidates.collect()
+    }
+}
+
+/// Continues a log straight on after its first step: who has no log walks on.
+pub(super) fn walk_on(log: &mut [Option<Pose>]) {
+    let [Some(from), Some(to), ..] = *log else {
+        return;
+    };
+    let step = from.inverse() * to;
+    let mut pose = to;
+    for next in &mut log[WARM_UP..] {
+        pose = pose * step;
+        *next = Some(pose);
     }
 }
 

@@ -37,6 +37,8 @@ const GAINS_MPS: f64 = 0.75;
 const STEPS: usize = 6;
 const SPACE_M: f64 = 2.0;
 const SIDE_M: f64 = 0.3;
+/// People walk around whoever is slower than this, metres per second.
+const STILL_MPS: f64 = 0.3;
 /// An agent is fast if it exceeds this share of its log's greatest speed within so many steps before and
 /// after the place, and this, metres per second: who waited for others may find the road free.
 const FASTER: f64 = 1.2;
@@ -139,7 +141,8 @@ impl Pace {
                     && shape(*own, now, (SPACE_M, SIDE_M)).overlaps(&shape(its, other, (0.0, 0.0)))
             };
             let is_person = other.body.kind == AgentKind::Pedestrian;
-            walks && is_person || !own.iter().enumerate().any(meets) || touches()
+            let stands = other.velocity().length() < STILL_MPS;
+            walks && (is_person || stands) || !own.iter().enumerate().any(meets) || touches()
         })
     }
 }
@@ -377,9 +380,13 @@ mod tests {
             pace().fault(&own, &Pose::new(1.0, 0.0, 0.0), others)
         };
         assert!(with(None) == 0.0 && with(its.as_ref()) > 0.0);
-        // People walk through each other.
+        // People walk through each other, around who stands, and wait for who drives.
         let own = agent(AgentKind::Pedestrian, (10.0, 0.5), 1.0);
-        let among = |kind| fault_among(&log, 3, own, 0.2, &[agent(kind, (13.0, 0.0), 0.0)]);
-        assert!(among(AgentKind::Pedestrian) > 0.0 && among(AgentKind::Vehicle) == 0.0);
+        let among = |kind, speed| {
+            let other = agent(kind, (13.0, 0.0), speed);
+            fault_among(&log, 3, own, 0.2, &[other])
+        };
+        assert!(among(AgentKind::Pedestrian, 0.0) > 0.0 && among(AgentKind::Vehicle, 0.0) > 0.0);
+        assert_eq!(among(AgentKind::Vehicle, 0.5), 0.0);
     }
 }

@@ -23,7 +23,7 @@ pub struct RelativeRewards {
     /// Weight of a penalty for collisions, for leaving the road and for passing red lights, at least
     /// 0: by how many standard deviations of the group the advantage of a move falls for each of the
     /// three that its agent first commits in this move or later and does not commit in the log.
-    /// People who overlap each other do not collide here.
+    /// Collisions of people do not count.
     pub dense: f64,
     /// The same for what a driver would notice: a stop on a free road, an acceleration beyond grip,
     /// and a vehicle that slips sideways, as [`gump_metrics::behaviour`] counts them.

@@ -704,6 +704,26 @@ fn a_crowd_stands_and_walks_in_the_way() {
     assert!(message.contains("a crowd of 65"), "{message}");
 }
 
+#[test]
+fn who_has_no_log_walks_on() {
+    let step = Pose::new(0.6, 0.0, 0.02);
+    let first = Pose::new(3.0, 4.0, 1.0);
+    let mut log = vec![Some(first); 6];
+    log[1] = Some(first * step);
+    drives::walk_on(&mut log);
+    let mut pose = first;
+    for found in log {
+        let found = found.unwrap();
+        assert!(found.position.distance(pose.position) < 1e-9, "{found:?}");
+        assert!((found.heading - pose.heading).abs() < 1e-9, "{found:?}");
+        pose = pose * step;
+    }
+    // Who is there for a moment only has no way.
+    let mut short = vec![Some(first), None, None];
+    drives::walk_on(&mut short);
+    assert_eq!(short, [Some(first), None, None]);
+}
+
 /// The tracks of a scenario at 2 Hz.
 fn tracks(scenario: &Scenario) -> Vec<Track> {
     let agents = scenario.log[0].agents();
