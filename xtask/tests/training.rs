@@ -341,6 +341,10 @@ fn the_recorded_stages_of_the_relative_network_can_be_run() {
             "relative-11.toml",
             "eleven --from further/weights.safetensors",
         ),
+        (
+            "relative-12.toml",
+            "twelve --from further/weights.safetensors",
+        ),
     ] {
         on_these(name);
         place.fails(
