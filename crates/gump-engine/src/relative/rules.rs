@@ -376,7 +376,8 @@ impl<'l> Shut<'l> {
 }
 
 /// Redraws moves of vehicles over a red light, into an occupied junction or into the way of one that has
-/// the right of way, up to `redraws` times each; a vehicle without another move brakes, if that stops it.
+/// the right of way, up to `redraws` times each; a vehicle without another move brakes, if that stops it, and
+/// steers onto its way into a driveway.
 pub(super) fn obey_lines(
     agents: &[Shown],
     driven: Option<usize>,
@@ -420,6 +421,10 @@ pub(super) fn obey_lines(
                 true => Pose::IDENTITY,
                 false => Pose::IDENTITY.interpolate(moves[i], most / length),
             };
+        }
+        let way = shut.turns_in[i].filter(|way| way.strays(now, moves[i]));
+        if let Some(step) = way.and_then(|way| way.steered(now, moves[i])) {
+            moves[i] = step;
         }
     }
 }

@@ -3,6 +3,7 @@
 use gump_geometry::Pose;
 use gump_model::relative::driveway::{Driveways, WayIn};
 use gump_model::relative::graph::Shown;
+use gump_model::steps::TOKEN_DT;
 use gump_scene::{Agent, AgentKind, BendLimits, Lane, LaneId, MapGraph, Seed, bend_speed};
 
 use crate::nucleus::uniform;
@@ -22,6 +23,13 @@ const ON_WAY: (f64, f64) = (1.5, 0.5);
 const LOST: (f64, f64) = (3.0, 1.2);
 /// A move in the turn is drawn again if it ends farther from its way than this, metres, and than it began.
 const STRAYS_M: f64 = 0.3;
+/// Who strays with all draws steers onto its way: so many turns to each side are tried, the sharpest with
+/// this acceleration to the side, metres per second squared, and by this, radians. Shorter moves count as so
+/// long, metres.
+const STEERS: i32 = 12;
+const STEERS_MPS2: f64 = 5.0;
+const STEERS_RAD: f64 = 0.6;
+const SHORT_M: f64 = 1.0;
 /// It decides this far before the turn at most, metres, and not if it had to brake harder than this for
 /// it, m/s², down to this speed, metres per second.
 const DECIDES_M: f64 = 16.0;
@@ -73,6 +81,26 @@ impl<'a> TakesWay<'a> {
         let off = |pose: Pose| self.lane.centerline.project(pose.position).distance;
         let after = off(now.pose * step);
         self.leaves_street(now) && after > STRAYS_M && after > off(now.pose)
+    }
+
+    /// A move of the same length that ends nearer to its way than this one, if it turns as sharply as
+    /// drivers do there.
+    pub(super) fn steered(&self, now: &Shown, step: Pose) -> Option<Pose> {
+        let length = step.position.length();
+        let most = (STEERS_MPS2 * TOKEN_DT * TOKEN_DT / length.max(SHORT_M)).min(STEERS_RAD);
+        // A radian beside the way's direction counts as a metre, as it soon costs one.
+        let off = |pose: Pose| {
+            let foot = self.lane.foot(pose);
+            foot.lateral_m.abs() + foot.turned
+        };
+        let turns = (-STEERS..=STEERS).map(|k| most * f64::from(k) / f64::from(STEERS));
+        let moves = turns.map(|turn| {
+            let (sin, cos) = (turn / 2.0).sin_cos();
+            Pose::new(length * cos, length * sin, turn)
+        });
+        let moves = moves.map(|step| (off(now.pose * step), step));
+        let (least, best) = moves.min_by(|a, b| a.0.total_cmp(&b.0))?;
+        (least < off(now.pose * step)).then_some(best)
     }
 
     /// Whether the vehicle is no longer on it.
