@@ -81,7 +81,8 @@ fn measured(
     let collides = component == Component::Collision;
     for (own, future) in firsts.iter_mut().zip(futures) {
         for ((first, &in_log), &id) in own.iter_mut().zip(&in_log).zip(agents) {
-            *first = first.filter(|_| !in_log && !(collides && is_person(future, id)));
+            let is_none = in_log || collides && is_person(future, id);
+            *first = first.filter(|_| !is_none);
         }
     }
     firsts
