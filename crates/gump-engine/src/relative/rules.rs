@@ -549,7 +549,7 @@ const STEERS_RAD: [f64; 10] = [
 const STEERS_MPS2: f64 = GRIP_MPS2 / 2.0;
 
 /// A move of the same length, forwards or backwards, that turns by so much.
-fn steered(step: Pose, turn: f64) -> Pose {
+pub(super) fn steered(step: Pose, turn: f64) -> Pose {
     let length = step.position.length().copysign(step.position.x);
     let (sin, cos) = (turn / 2.0).sin_cos();
     Pose::new(length * cos, length * sin, turn)

@@ -8,6 +8,7 @@ use gump_scene::{Agent, AgentKind, BendLimits, Lane, LaneId, MapGraph, Seed, ben
 
 use crate::nucleus::uniform;
 use crate::relative::approach::slowing_before;
+use crate::relative::rules::steered;
 
 // Chosen by hand, but for the shares, which are those of recorded scenes (decision 37).
 
@@ -83,8 +84,8 @@ impl<'a> TakesWay<'a> {
         self.leaves_street(now) && after > STRAYS_M && after > off(now.pose)
     }
 
-    /// A move of the same length that ends nearer to its way than this one, if it turns as sharply as
-    /// drivers do there.
+    /// The move of the same length that ends nearest to its way, of those that turn no more sharply than
+    /// drivers do there; `None` if this one ends as near.
     pub(super) fn steered(&self, now: &Shown, step: Pose) -> Option<Pose> {
         let length = step.position.length();
         let most = (STEERS_MPS2 * TOKEN_DT * TOKEN_DT / length.max(SHORT_M)).min(STEERS_RAD);
@@ -94,10 +95,7 @@ impl<'a> TakesWay<'a> {
             foot.lateral_m.abs() + foot.turned
         };
         let turns = (-STEERS..=STEERS).map(|k| most * f64::from(k) / f64::from(STEERS));
-        let moves = turns.map(|turn| {
-            let (sin, cos) = (turn / 2.0).sin_cos();
-            Pose::new(length * cos, length * sin, turn)
-        });
+        let moves = turns.map(|turn| steered(step, turn));
         let moves = moves.map(|step| (off(now.pose * step), step));
         let (least, best) = moves.min_by(|a, b| a.0.total_cmp(&b.0))?;
         (least < off(now.pose * step)).then_some(best)
